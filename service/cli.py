@@ -1,0 +1,287 @@
+"""The command `frit`: words in; a launch, a picture or a schema out.
+
+Exit status: 0 done, 1 the run failed, 2 the input was refused, 130 interrupted with a checkpoint written.
+What a command imports beyond the terminal is imported inside it: `frit --help` is quick.
+"""
+
+import importlib.metadata
+import json
+import math
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Table
+
+from .launch import Launch, LaunchError, Outcome, read_record
+
+if TYPE_CHECKING:
+    from frit.solver.case import Case
+
+EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
+GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
+COLUMNS = (
+    "t {task.fields[time]}",
+    "step {task.fields[step]}",
+    "{task.fields[speed]} ev/s",
+    "live {task.fields[live]}",
+    "vacancy {task.fields[vacancy]}",
+    "{task.fields[remaining]} left",
+)
+
+app = typer.Typer(
+    name="frit",
+    help="Meshfree phase-field sintering of metal particles.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+CaseFile = Annotated[Path, typer.Argument(metavar="CASE.toml", exists=True, dir_okay=False, help="Or JSON.")]
+Ranks = Annotated[int, typer.Option(min=1, metavar="N", help="MPI ranks.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
+RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False)]
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+def refuse(*lines: str) -> NoReturn:
+    """Say on stderr what is wrong with the input, and leave with 2."""
+    for line in lines:
+        typer.echo(line, err=True)
+    raise typer.Exit(2)
+
+
+def show_version(wanted: bool) -> None:
+    """Option callback."""
+    if wanted:
+        typer.echo(f"frit {importlib.metadata.version('frit')}")
+        raise typer.Exit
+
+
+@app.callback()
+def frit(
+    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True)] = False,
+) -> None:
+    """Options before the command."""
+
+
+@app.command()
+def run(
+    case: CaseFile,
+    ranks: Ranks = 1,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", file_okay=False, help="Run directory; default: runs/CASE.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run one case here; Ctrl-C writes a checkpoint and ends."""
+    name = read_case(case).name
+    directory = out or Path("runs") / case.stem
+    state = read_record(directory).get("state")
+    if (directory / "run.json").exists() and state != "refused":
+        refuse(
+            f"--out {directory}: the folder holds a run already (state: {state})",
+            f"`frit resume {directory}` goes on with it; --out DIR names another folder",
+        )
+    follow(name, ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json)
+
+
+@app.command()
+def resume(
+    directory: RunDirectory,
+    ranks: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="MPI ranks; default: as before.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Go on from the last checkpoint."""
+    record = read_record(directory)
+    if record.get("state") == "done":
+        typer.echo(f"{directory} is done already", err=True)
+        report(directory, Outcome("done", record.get("message"), 0, ""), {}, None, as_json)
+        return
+    if not (directory / "checkpoint.h5").exists():
+        refuse(f"{directory} has no checkpoint.h5 to go on from: start its case anew with `frit run`")
+    ranks = ranks or int(record.get("ranks", 1))
+    follow(directory.name, ranks, ["--resume", str(directory), "--progress"], directory, as_json)
+
+
+@app.command()
+def plot(
+    directory: RunDirectory,
+    time: Annotated[
+        float | None, typer.Option(metavar="T", help="Model time; the nearest snapshot is shown.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: in DIR; also .pdf, .svg.")
+    ] = None,
+) -> None:
+    """Picture of the snapshot nearest to --time; of the history without it."""
+    from frit.sweeps import plots
+
+    try:
+        if time is None:
+            out = out or directory / "history.png"
+            plots.plot_history(directory, out)
+            typer.echo(f"{out}: history")
+        else:
+            time = plots.nearest_time(directory, time)
+            out = out or directory / f"snapshot-{time:g}.png"
+            plots.plot_snapshot(directory, time, out)
+            typer.echo(f"{out}: snapshot at t = {time:g}")
+    except (ValueError, OSError) as error:
+        refuse(str(error))
+
+
+@app.command()
+def schema() -> None:
+    """JSON Schema of the case file."""
+    from frit.solver.case import case_schema
+
+    typer.echo(json.dumps(case_schema(), indent=2))
+
+
+def read_case(path: Path) -> "Case":
+    """The checked case; a wrong one is refused with a line per problem."""
+    from frit.solver.case import CaseError, load_case
+
+    try:
+        return load_case(path)
+    except CaseError as error:
+        refuse(*(f"{path}: {line}" for line in str(error).splitlines()))
+
+
+# --- following a launch ---------------------------------------------------------------------------------
+
+
+def follow(name: str, ranks: int, arguments: list[str], directory: Path, as_json: bool) -> NoReturn:
+    """Launch the solver, show its progress to the end, and leave with the exit status of its outcome."""
+    try:
+        launch = Launch(ranks, arguments, directory)
+    except (LaunchError, OSError) as error:
+        refuse(str(error))
+    start, progress = monotonic(), dict[str, Any]()
+    with launch, progress_bar(name) as (bar, task), signals_passed_on(launch, bar, task):
+        for progress in launch:
+            bar.update(task, completed=progress.get("time"), total=progress.get("end"), **shown(progress))
+        outcome = launch.wait()
+    report(directory, outcome, progress, monotonic() - start, as_json)
+    raise typer.Exit(EXIT[outcome.state])
+
+
+@contextmanager
+def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[None]:
+    """INT, TERM, HUP: one TERM to the ranks; a second INT kills. What nohup or & had ignored stays so."""
+
+    def handle(number: int, _: object) -> None:
+        if launch.stopping and number == signal.SIGINT:
+            launch.kill()
+        launch.stop(GRACE)
+        bar.update(task, description="writing a checkpoint; Ctrl-C again kills")
+
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
+    for number in heard:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number in heard:
+            signal.signal(number, before[number])
+
+
+@contextmanager
+def progress_bar(name: str) -> Iterator[tuple[Progress, TaskID]]:
+    """On stderr, and only where somebody sees it."""
+    bar = Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=16),
+        *(TextColumn(column, markup=False) for column in COLUMNS),
+        console=Console(stderr=True),
+        disable=not (sys.stdout.isatty() and sys.stderr.isatty()),
+    )
+    with bar:
+        yield bar, bar.add_task(name, total=None, **shown({}))
+
+
+def shown(progress: dict[str, Any]) -> dict[str, Any]:
+    """A progress line in words; what rank 0 does not know yet is a dash."""
+
+    def word(key: str, form: str) -> str:
+        value = progress.get(key)
+        return "-" if value is None else format(value, form)
+
+    left = progress.get("remaining")
+    return {
+        "time": f"{word('time', '.4g')}/{word('end', '.4g')}",
+        "step": word("step", "d"),
+        "speed": word("evaluations_per_second", ".3g"),
+        "live": word("live_fraction", ".0%"),
+        "vacancy": word("vacancy_ratio", ".4f"),
+        "remaining": "-" if left is None else str(timedelta(seconds=round(left))),
+    }
+
+
+def report(
+    directory: Path, outcome: Outcome, progress: dict[str, Any], wall_time: float | None, as_json: bool
+) -> None:
+    """The summary on stdout; what went wrong and how to go on, on stderr."""
+    summary = summarise(directory, outcome, progress, wall_time)
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+    else:
+        table = Table(show_header=False, box=None)
+        for key, value in summary.items():
+            values = value if isinstance(value, list) else [value]
+            table.add_row(key.replace("_", " "), " -> ".join(in_words(v) for v in values))
+        Console().print(table, highlight=False, markup=False)
+    if outcome.state in ("failed", "refused"):
+        lines = [outcome.errors, outcome.message, f"see {directory / 'log.txt'}"]
+        typer.echo("\n".join(filter(None, lines)), err=True)
+    elif outcome.state == "interrupted":
+        typer.echo(f"interrupted; `frit resume {directory}` goes on", err=True)
+
+
+def in_words(value: object) -> str:
+    """A cell of the summary."""
+    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def summarise(
+    directory: Path, outcome: Outcome, progress: dict[str, Any], wall_time: float | None
+) -> dict[str, Any]:
+    """The run so far, from its last history row or the last progress line; `wall_time` is this launch's."""
+    from frit.sweeps.plots import read_history
+
+    history = read_history(directory)
+    last = {key: column[-1].item() for key, column in history.items()}
+    if progress.get("time", -math.inf) >= last.get("time", -math.inf):
+        last |= progress
+    first = [column[0].item() for key, column in history.items() if key == "vacancy_ratio"]
+    return {
+        "state": outcome.state,
+        "message": outcome.message,
+        "time": finite(last.get("time")),
+        "steps": last.get("step"),
+        "evaluations": last.get("evaluations"),
+        "wall_time": last.get("wall_time") if wall_time is None else round(wall_time, 2),
+        "vacancy_ratio": [finite(v) for v in (*first, last.get("vacancy_ratio"))],
+        "directory": str(directory),
+    }
+
+
+def finite(value: float | None) -> float | None:
+    """JSON knows no NaN."""
+    return value if value is not None and math.isfinite(value) else None

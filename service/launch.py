@@ -1,0 +1,202 @@
+"""Start the solver under MPI, follow it, stop it, judge its end. Knows no terminal and no database."""
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+ENDS = ("done", "failed", "interrupted", "refused")
+SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL")  # PMI covers PMIX
+THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM")
+OPEN_MPI = dict.fromkeys(AS_ROOT, "1") | {"OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self,sm"}
+
+
+class LaunchError(RuntimeError):
+    """Nothing was started: no mpirun, or the run directory is in use."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """`state` is one of ENDS; `errors` is the last that mpirun and the ranks said outside log.txt."""
+
+    state: str
+    message: str | None
+    returncode: int
+    errors: str
+
+
+def solver_arguments() -> list[str]:
+    """-P: a user's own `frit/` in the working folder is not picked up."""
+    return [sys.executable, "-P", "-m", "frit.solver"]
+
+
+def find_mpirun() -> str:
+    """The one pip put beside this interpreter comes before the system's."""
+    beside = Path(sys.executable).parent
+    path = os.pathsep.join([str(beside), os.environ.get("PATH", os.defpath)])
+    if (found := shutil.which("mpirun", path=path)) is None:
+        raise LaunchError(f"no mpirun in {beside} nor on PATH: pip install mpich")
+    return found
+
+
+@cache
+def is_open_mpi(mpirun: str) -> bool:
+    """mpich's hydra answers `HYDRA build details`."""
+    shown = subprocess.run([mpirun, "--version"], capture_output=True, text=True, check=False)
+    return "Open MPI" in shown.stdout or "OpenRTE" in shown.stdout
+
+
+def mpirun_command(ranks: int, arguments: Sequence[str]) -> list[str]:
+    """The whole command line; `arguments` are the solver's."""
+    mpirun = find_mpirun()
+    extra = ["--oversubscribe", "--bind-to", "none"] if is_open_mpi(mpirun) else []
+    return [mpirun, *extra, "-n", str(ranks), *solver_arguments(), *arguments]
+
+
+def clean_environment(environ: Mapping[str, str]) -> dict[str, str]:
+    """Without an outer MPI or Slurm step, which the ranks would join; one thread a rank unless set."""
+    kept = {key: value for key, value in environ.items() if not key.startswith(SCRUBBED)}
+    return dict.fromkeys(THREADS, "1") | kept
+
+
+def read_record(directory: Path) -> dict[str, Any]:
+    """run.json; empty when it is not there or torn."""
+    try:
+        record = json.loads((directory / "run.json").read_text())
+    except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+class Launch:
+    """One mpirun tree in a session of its own: a terminal's Ctrl-C reaches only its parent.
+
+    Iterate over the progress, then wait(); leaving the `with` block kills what is left. If the parent is
+    killed -9 the tree may go on, and then holds the lock of the directory: nobody resumes it a second time.
+    """
+
+    def __init__(self, ranks: int, arguments: Sequence[str], directory: Path) -> None:
+        command = mpirun_command(ranks, arguments)
+        environment = (OPEN_MPI if is_open_mpi(command[0]) else {}) | clean_environment(os.environ)
+        # mpich gives each rank a session of its own: only a mark finds those whose mpirun is gone.
+        environment["FRIT_LAUNCH"] = mark = uuid.uuid4().hex
+        self._mark = f"FRIT_LAUNCH={mark}".encode()
+        self.directory, self.stopping = directory, False
+        self._spoken: deque[str] = deque(maxlen=40)
+        directory.mkdir(parents=True, exist_ok=True)
+        lock = _lock(directory)
+        self._record_before = _stamp(directory / "run.json")
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                encoding="utf-8",
+                errors="replace",
+                env=environment,
+                pass_fds=[lock],
+                start_new_session=True,
+            )
+        finally:
+            os.close(lock)
+        self._reaper = threading.Thread(target=self._reap, daemon=True)
+        self._reaper.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self.kill()
+        self._reaper.join()
+        if self._process.stdout:
+            self._process.stdout.close()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Progress as rank 0 prints it, until mpirun ends; what else is said is kept for the Outcome."""
+        for line in self._process.stdout or ():
+            progress = None
+            with suppress(json.JSONDecodeError):
+                progress = json.loads(line)
+            if isinstance(progress, dict):
+                yield progress
+            elif line.strip():
+                self._spoken.append(line.rstrip())
+
+    def checkpoint(self) -> None:
+        """Ask the ranks for a checkpoint now."""
+        self._process.send_signal(signal.SIGUSR1)
+
+    def stop(self, grace: float) -> None:
+        """Ask for a checkpoint and the end; kill after `grace` seconds. Returns at once, counts once."""
+        if not self.stopping:
+            self.stopping = True
+            self._process.send_signal(signal.SIGTERM)
+            timer = threading.Timer(grace, self.kill)
+            timer.daemon = True
+            timer.start()
+
+    def kill(self) -> bool:
+        """Kill mpirun and whatever carries the mark (found on Linux); true if any did."""
+        self._process.kill()
+        found = False
+        for environ in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):  # not ours, or gone meanwhile
+                if self._mark in environ.read_bytes():
+                    os.kill(int(environ.parent.name), signal.SIGKILL)
+                    found = True
+        return found
+
+    def wait(self) -> Outcome:
+        """What run.json says, if it was written since the start, once the whole tree is gone."""
+        for _ in self:
+            pass
+        self._reaper.join()
+        record, code, spoken = read_record(self.directory), self._process.returncode, "\n".join(self._spoken)
+        fresh = _stamp(self.directory / "run.json") != self._record_before
+        if fresh and record.get("state") in ENDS:
+            return Outcome(record["state"], record.get("message"), code, spoken)
+        if self.stopping and (self.directory / "checkpoint.h5").exists():
+            return Outcome("interrupted", "no new checkpoint was written; the last one stands", code, spoken)
+        return Outcome("failed", f"mpirun ended with status {code} and no word of the solver", code, spoken)
+
+    def _reap(self) -> None:
+        """mpirun's end is the end of all: no orphan stays, and the lock is free when wait() returns."""
+        self._process.wait()
+        for _ in range(100):
+            if not self.kill():
+                break
+            time.sleep(0.01)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Differs once the file is replaced or written anew."""
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
+
+
+def _lock(directory: Path) -> int:
+    """A descriptor for the tree to inherit: it holds the directory until the last process is gone."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise LaunchError(f"{directory} is in use by a run that has not ended") from None
+    except OSError:
+        pass  # a network file system without such locks
+    return descriptor

@@ -1,0 +1,255 @@
+"""`mpirun -n N python -P -m frit.solver CASE --out DIR` runs a case, `... --resume DIR` goes on with one.
+
+Signals: USR1 writes a checkpoint, TERM and INT write one and end the run. The end is told by run.json (`state`: running,
+done, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
+"""
+
+import argparse
+import json
+import platform
+import signal
+import socket
+import sys
+import time
+import traceback
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import checkpoint, output
+from .case import Case, CaseError, load_case
+from .checkpoint import CheckpointError
+from .geometry import Mesh, MeshError
+from .integrators import Integrator
+from .observe import Observables
+from .partition import Collector, Ranks, mpi_library
+from .prepare import build_mesh, make_integrator, prepare
+from .run import RunError, run
+from .scheme import Scheme
+from .shape import ShapeError
+from .state import State
+
+Floats = NDArray[np.float64]
+
+REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, output.DirectoryError)
+PROGRESS_EVERY = 0.25  # seconds between two progress lines
+EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
+
+
+def main() -> int:
+    """Run; any exception on one rank is written down and ends all ranks."""
+    arguments = parser().parse_args()
+    ranks = Ranks.world()
+    directory = Path(arguments.resume or arguments.out)
+    try:
+        state, message = execute(arguments, ranks, directory)
+    except BaseException as error:
+        return give_up(error, ranks, directory)
+    if ranks.root:
+        record_end(directory, state, message)
+    return EXIT_STATUS[state]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    result = argparse.ArgumentParser(prog="frit.solver", description="Run one case under MPI.")
+    result.add_argument("case", nargs="?", help="case file (TOML or JSON)")
+    result.add_argument("--out", help="run directory to make")
+    result.add_argument("--resume", metavar="DIR", help="run directory to go on with")
+    result.add_argument("--progress", action="store_true", help="print progress as JSON lines")
+    return result
+
+
+def execute(arguments: argparse.Namespace, ranks: Ranks, directory: Path) -> tuple[str, str | None]:
+    """The whole run: how it ended, and a message where it did not end well."""
+    fresh = arguments.resume is None
+    if fresh == (arguments.case is None) or fresh == (arguments.out is None):
+        raise output.DirectoryError("give either CASE --out DIR or --resume DIR")
+    case: Case = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
+    mesh = build_mesh(case, ranks)
+    kept = None if fresh else ranks.from_root(checkpoint.read(directory, case.identity(), mesh) if ranks.root else None)
+    scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
+    if kept:
+        nodes = scheme.d.share.nodes
+        state.u[:] = kept.state.u[nodes]
+    integrator = make_integrator(case, mesh, kept.memory if kept else None)
+    recorder = Recorder(directory, mesh, scheme, state, kept.wall_time if kept else None, arguments.progress)
+    try:
+        finished = run(scheme, state, integrator, recorder)
+        recorder.checkpoint(scheme, state, integrator)
+    except (RunError, FloatingPointError) as error:
+        return "failed", f"{error}; the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
+    finally:
+        recorder.close()
+    return ("done", None) if finished else ("interrupted", f"checkpoint at t = {state.time:.6g}")
+
+
+def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:
+    """Rank 0: lock the run directory, and write or read its case."""
+    if arguments.resume:
+        if not (directory / checkpoint.NAME).exists():
+            raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from")
+        output.lock(directory)
+        return load_case(directory / "case.json")
+    case = load_case(arguments.case)
+    directory.mkdir(parents=True, exist_ok=True)
+    output.lock(directory)
+    if (directory / checkpoint.NAME).exists():
+        raise output.DirectoryError(f"{directory}: holds a run already; go on with --resume")
+    (directory / "case.json").write_text(case.resolved_json() + "\n")
+    return case
+
+
+class Recorder:
+    """Listens to the run: history, snapshots, checkpoints, progress. All methods are collective."""
+
+    def __init__(
+        self, directory: Path, mesh: Mesh, scheme: Scheme, state: State, wall_time: float | None, progress: bool
+    ) -> None:
+        """wall_time: seconds that the run has already taken before it was resumed; None: a fresh run."""
+        case, self.ranks = scheme.d.case, scheme.d.share.ranks
+        fresh = wall_time is None
+        self.directory, self.mesh, self.progress = directory, mesh, progress
+        self.began = time.monotonic() - (wall_time or 0.0)
+        self.collector = Collector(scheme.d.share, output.block_size(len(mesh.nodes), self.ranks))
+        self.observables = Observables(case, mesh, scheme.d, len(state.slot_of))
+        self.rows = output.History(directory, None if fresh else state.time) if self.ranks.root else None
+        self.snapshots = output.Snapshots(directory, case, mesh, self.collector, fresh)
+        self.flags = {signal.SIGUSR1: False, signal.SIGTERM: False}
+        self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
+        self.vacancy_ratio, self.live_fraction = 0.0, 1.0
+        self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
+        for number in (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._signalled)
+        if self.ranks.root:
+            record_start(directory, case, self.ranks.size, fresh)
+
+    def _signalled(self, number: int, frame: object) -> None:
+        self.flags[signal.SIGUSR1 if number == signal.SIGUSR1 else signal.SIGTERM] = True
+
+    def history(self, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
+        """Append a row."""
+        row = self.observables.row(scheme, state, u, time_, self._wall_time())
+        self.vacancy_ratio, self.live_fraction = row["vacancy_ratio"], row["live_fraction"]
+        if self.rows is not None:
+            self.rows.append(row)
+
+    def snapshot(self, number: int, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
+        """Write a snapshot."""
+        self.snapshots.write(number, time_, state, u)
+
+    def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
+        """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
+        due = time.monotonic() - self.checkpoint_clock >= scheme.d.case.output.checkpoint_every
+        wanted = np.array([due and self.ranks.root, self.flags[signal.SIGUSR1], self.flags[signal.SIGTERM]], dtype=float)
+        due, asked, stop = self.ranks.max(wanted) > 0.0
+        if (due or asked) and not stop:
+            self.checkpoint(scheme, state, integrator)
+        self._show(scheme, state)
+        return bool(stop)
+
+    def checkpoint(self, scheme: Scheme, state: State, integrator: Integrator) -> None:
+        """Make the state durable, and the rows before it."""
+        if self.rows is not None:
+            self.rows.sync()
+        notes = {
+            "identity": scheme.d.case.identity(), "memory": integrator.memory, "wall_time": self._wall_time(),
+        }  # fmt: skip
+        checkpoint.write(self.directory, scheme, state, self.collector, self.mesh, notes)
+        self.checkpoint_time, self.checkpoint_clock = state.time, time.monotonic()
+        self.flags[signal.SIGUSR1] = False
+
+    def close(self) -> None:
+        """Close the history."""
+        if self.rows is not None:
+            self.rows.close()
+
+    def _wall_time(self) -> float:
+        return time.monotonic() - self.began
+
+    def _show(self, scheme: Scheme, state: State) -> None:
+        """Print a progress line, at most four a second."""
+        clock = time.monotonic()
+        if not (self.progress and self.ranks.root) or clock - self.shown < PROGRESS_EVERY:
+            return
+        self.shown = clock
+        began, time_0, evaluations_0 = self.started
+        elapsed, end = max(clock - began, 1e-9), scheme.d.case.time.end
+        speed = (state.time - time_0) / elapsed
+        line = {
+            "time": state.time, "end": end, "step": state.step, "evaluations": state.evaluations,
+            "evaluations_per_second": (state.evaluations - evaluations_0) / elapsed,
+            "live_fraction": self.live_fraction,
+            "vacancy_ratio": self.vacancy_ratio,
+            "remaining": (end - state.time) / speed if speed > 0.0 else None,
+        }  # fmt: skip
+        print(json.dumps(line), flush=True)
+
+
+def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
+    """run.json: what runs here, with which versions, since when. A resumed run keeps the first start."""
+    path = directory / "run.json"
+    before = json.loads(path.read_text()) if path.exists() and not fresh else {}
+    record = {
+        "state": "running",
+        "message": None,
+        "case": case.identity(),
+        "name": case.name,
+        "ranks": ranks,
+        "host": socket.gethostname(),
+        "seeds": {"particles": getattr(case.particles, "seed", None)},
+        "versions": versions(),
+        "start": before.get("start", output.now()),
+        "resumed": [*before.get("resumed", []), *([] if fresh else [output.now()])],
+        "end": None,
+    }
+    output.write_json(path, record)
+
+
+def record_end(directory: Path, state: str, message: str | None) -> None:
+    """How it ended, into run.json; the message into log.txt too."""
+    path = directory / "run.json"
+    record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    record |= {"state": state, "message": message, "end": output.now()}
+    output.write_json(path, record)
+    with open(directory / "log.txt", "a") as log:
+        log.write(f"{output.now()} {state}{': ' + message if message else ''}\n")
+    if message:
+        print(f"{state}: {message}", file=sys.stderr, flush=True)
+
+
+def versions() -> dict[str, str]:
+    """What computed the results."""
+    found = {"python": platform.python_version(), "mpi": mpi_library()}
+    for name in ("frit", "numpy", "numba", "scipy", "mpi4py", "h5py", "zarr"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def give_up(error: BaseException, ranks: Ranks, directory: Path) -> int:
+    """Write down what went wrong on this rank, and end all ranks."""
+    refused = isinstance(error, REFUSALS)
+    where = f"rank {ranks.rank}: " if ranks.size > 1 and not refused else ""
+    message = f"{where}{error}" if refused else f"{where}{type(error).__name__}: {error}"
+    if isinstance(error, output.DirectoryError):
+        print(f"refused: {message}", file=sys.stderr, flush=True)  # the directory is not ours to write into
+    else:
+        directory.mkdir(parents=True, exist_ok=True)
+        if not refused:
+            with open(directory / "log.txt", "a") as log:
+                log.write(where + "".join(traceback.format_exception(error)))
+            traceback.print_exception(error)
+        record_end(directory, "refused" if refused else "failed", message)
+    if ranks.size > 1:
+        ranks.abort(EXIT_STATUS["refused" if refused else "failed"])
+    return EXIT_STATUS["refused" if refused else "failed"]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,195 @@
+"""Where something happens: live material points, the slots that exist there, and what the still ones owe.
+
+A point is live where |grad rho| >= eps_rho or any |grad eta| >= eps_eta (section 2.4). Switching a point off must not
+change its neighbours: it shares nodes with live points, and those nodes need its part of W (24) and of the advection
+(20), (21). Both are computed once, when the set is made, and hold as long as the shared nodal values stand still.
+`Active.stale` watches exactly those values; the set is made anew when one has moved by more than eps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels, slots
+from .discretisation import Discretisation
+from .rigid import rotations
+from .simd import LANES
+from .state import State, width
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Numbers = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Active:
+    """The live points and their surroundings at one moment; arrays over this rank's points and nodes."""
+
+    live: Integers  # (L,) numbers of the live points
+    owner: Numbers  # (L, F - 1) particle of each slot at the live points, -1: none
+    nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
+    owned: Integers  # those of them that this rank owns
+    potential: Floats  # (n,) what this rank's still points owe to W, times m_a
+    edge_nodes: Integers  # nodes between live points and a particle's still interior
+    edge_particle: Numbers  # that particle
+    drift: Floats  # (edges, 2, dim + rotations) what still points owe to the advection there
+    moments: Floats  # (particles, 1 + dim) int eta, int r eta over the owned nodes that stand still
+    reference: Floats  # (n, F) the fields when the set was made
+    watched: Integers  # nodes whose values decide whether the set still holds
+    watch: Integers  # (n,) which of their fields, see `kernels.watch_nodes`
+
+    def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
+        """Largest movement of a watched value, in units of its eps: at 1 the set must be made anew."""
+        return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta))
+
+
+def activate(d: Discretisation, state: State) -> Active:
+    """Make the set for the state. The state's order parameters below eps_eta are set to zero, and its slots are moved
+    where particles that shared one have come close. Collective; the result does not depend on the number of ranks.
+    """
+    switch = d.case.activation
+    if switch.few_order_parameters:
+        _drop_small(state, switch.eps_eta)
+        _compact(d, state)
+    flags, owner = _settle(d, state)
+    table = d.shape
+    low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
+    high = np.full(d.nodes, -1, dtype=np.int64)
+    kernels.interiors(low, high, flags, owner, state.u, table.offsets, table.nodes, table.table)
+    _spread(d, low, high)
+    mixed = low < high
+    if mixed.any():
+        flags[np.logical_or.reduceat(mixed[table.nodes], table.offsets[:-1])] = 1
+    live = np.flatnonzero(flags)
+    moving, resting = _touched(d, flags != 0), _touched(d, flags == 0)
+    edge_nodes = np.flatnonzero(moving & resting & (high >= 0))
+    potential, drift = _still_shares(d, state, flags, owner, edge_nodes, high)
+    still = d.share.owned[~moving[d.share.owned]]
+    moments = np.zeros((len(state.slot_of), 1 + d.dim))
+    kernels.add_moments(moments, state.u, still, state.owner, d.mass, d.first_moment)
+    watch = np.zeros(d.nodes, dtype=np.int64)
+    kernels.watch_nodes(watch, flags, owner, state.owner, table.offsets, table.nodes)
+    return Active(
+        live=live,
+        owner=owner[live],
+        nodes=np.flatnonzero(moving),
+        owned=d.share.owned[moving[d.share.owned]],
+        potential=potential,
+        edge_nodes=edge_nodes,
+        edge_particle=high[edge_nodes].astype(np.int32),
+        drift=drift,
+        moments=moments,
+        reference=state.u.copy(),
+        watched=np.flatnonzero(moving & (watch != 0)),
+        watch=watch,
+    )
+
+
+def _drop_small(state: State, eps: float) -> None:
+    """An order parameter below eps is zero, and its slot is free again."""
+    small = np.abs(state.eta) < eps
+    state.eta[small] = 0.0
+    state.owner[small] = -1
+
+
+def _compact(d: Discretisation, state: State) -> None:
+    """Give back packs of slots that the thinner tails of the particles no longer need."""
+    if state.u.shape[1] == LANES:
+        return
+    _, owner, _ = _sense(d, state)
+    pairs = _everyones_pairs(d, slots.meeting(owner, np.arange(len(owner))))
+    slot_of = slots.colour(pairs, len(state.slot_of))
+    columns = width(int(slot_of.max()) + 1)
+    if columns < state.u.shape[1]:
+        state.slot_of = slot_of
+        state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
+
+
+def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
+    """Flags and slot owners of the points; slots are moved until no point and no claimed node sees two particles in one."""
+    while True:
+        flags, owner, clash = _sense(d, state)
+        if not d.case.activation.enabled:
+            flags[:] = 1
+        if not d.case.activation.few_order_parameters:
+            return flags, owner
+        marked = np.flatnonzero(flags)
+        claims = state.owner.copy()
+        crowded = np.empty((marked.size, 2), dtype=np.int64)
+        kernels.claim(claims, crowded, marked, owner[marked], d.shape.offsets, d.shape.nodes)
+        mine = claims.copy()
+        d.share.halo.most(claims)
+        torn = (mine >= 0) & (mine != claims)
+        found = [clash[marked], crowded, np.stack([mine[torn], claims[torn]], axis=1)]
+        clashes = _everyones_pairs(d, np.concatenate(found))
+        if not len(clashes):
+            state.owner = claims
+            return flags, owner
+        meetings = _everyones_pairs(d, slots.meeting(owner, marked))
+        state.slot_of = slots.recolour(state.slot_of, slots.unique_pairs(np.concatenate([meetings, clashes])))
+        columns = max(width(int(state.slot_of.max()) + 1), state.u.shape[1])
+        state.u, state.owner = slots.repack(state.u, state.owner, state.slot_of, columns)
+
+
+def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]:
+    table, switch = d.shape, d.case.activation
+    flags = np.empty(table.points, dtype=np.int32)
+    owner = np.empty((table.points, state.owner.shape[1]), dtype=np.int32)
+    clash = np.empty((table.points, 2), dtype=np.int64)
+    kernels.sense(
+        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, d.dim,
+        table.offsets, table.nodes, table.table,
+    )
+    return flags, owner, clash
+
+
+def _everyones_pairs(d: Discretisation, pairs: Integers) -> Integers:
+    """The distinct pairs that any rank found."""
+    return slots.unique_pairs(np.concatenate(d.share.ranks.everyones(slots.unique_pairs(pairs))))
+
+
+def _spread(d: Discretisation, low: Integers, high: Integers) -> None:
+    """Smallest `low` and largest `high` over the holders of each shared node."""
+    d.share.halo.most(high)
+    np.negative(low, out=low)
+    d.share.halo.most(low)
+    np.negative(low, out=low)
+
+
+def _touched(d: Discretisation, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which nodes a chosen point of any rank sees."""
+    touched = np.zeros(d.nodes, dtype=np.int8)
+    touched[d.shape.nodes[np.repeat(chosen, np.diff(d.shape.offsets))]] = 1
+    d.share.halo.most(touched)
+    return touched.astype(bool)
+
+
+def _still_shares(
+    d: Discretisation, state: State, flags: Numbers, owner: Numbers, edge_nodes: Integers, interior: Integers
+) -> tuple[Floats, Floats]:
+    """What still points owe to W, and to the advection at the edge nodes.
+
+    The drift that the nodes beyond the edge would get is the quadrature's error in sum_p w_p grad N_a = 0. It is left
+    out there, so its sum is taken from the edge nodes by volume: mass stays conserved to round-off.
+    """
+    table = d.shape
+    edge = np.full(d.nodes, -1, dtype=np.int64)
+    edge[edge_nodes] = np.arange(edge_nodes.size)
+    potential = np.zeros(d.nodes)
+    drift = np.zeros((edge_nodes.size, 2, d.dim + rotations(d.dim)))
+    kernels.still_shares(
+        potential, drift, flags, edge, owner, state.u, d.weights, d.x,
+        table.offsets, table.nodes, table.table, d.coefficients, d.huang,
+    )
+    particle = interior[edge_nodes]
+    excess = np.zeros((len(state.slot_of), *drift.shape[1:]))
+    np.add.at(excess, particle, drift)
+    volume = np.zeros(len(state.slot_of))
+    owned = d.share.halo.owned[edge_nodes]
+    np.add.at(volume, particle[owned], d.mass[edge_nodes[owned]])
+    d.share.ranks.sum(excess)
+    d.share.ranks.sum(volume)
+    mean = excess / np.where(volume > 0.0, volume, 1.0)[:, None, None]
+    drift[owned] -= d.mass[edge_nodes[owned], None, None] * mean[particle[owned]]
+    return potential, drift

@@ -1,0 +1,615 @@
+"""The case: one frozen model per table of the case file, complete and checked at birth.
+
+Checks come in three stages: each value by itself; each table (which fields go with its source); the whole
+case (dimensions, geometry, times). Lengths are in nm; time and energy are the model's own units, written [1].
+Equations, sections and tables are those of Huang et al. (2023).
+"""
+
+import difflib
+import hashlib
+import json
+import math
+import os
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count, takewhile
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from scipy.spatial import cKDTree
+
+ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
+
+# --- vocabulary
+
+Floats = NDArray[np.float64]
+FINITE = Field(strict=True, allow_inf_nan=False)
+ONE_ZERO = AfterValidator(lambda x: x + 0.0)  # no -0.0: equal cases have one identity
+Number = Annotated[float, FINITE, ONE_ZERO]
+NonNegative = Annotated[float, FINITE, Field(ge=0), ONE_ZERO]
+Positive = Annotated[float, FINITE, Field(gt=0)]
+Fraction = Annotated[float, FINITE, Field(gt=0, lt=1)]
+Flag = Annotated[bool, Field(strict=True)]
+Text = Annotated[str, Field(strict=True)]
+Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
+Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
+Box = tuple[Point, Point]
+Key = Sequence[
+    str | int
+]  # where pydantic found a value: names, indices, and "|form" where a value has two forms
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One refused value: its dotted key, the value (None where there is none to show) and what is allowed."""
+
+    key: str
+    value: Any
+    allowed: str
+
+    def __str__(self) -> str:
+        shown = text if len(text := repr(self.value)) <= 80 else text[:77] + "..."
+        return (
+            f"{self.key}: {self.allowed}" if self.value is None else f"{self.key} = {shown}: {self.allowed}"
+        )
+
+
+class CaseError(ValueError):
+    """A refused case and everything that is wrong with it: one line of `str()` per problem."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(map(str, self.problems)))
+
+
+def _refuse(problems: Iterable[Problem]) -> None:
+    """Raise them, if there are any. Validators give keys relative to what they validate."""
+    if found := tuple(problems):
+        raise CaseError(found)
+
+
+class Table(BaseModel):
+    """A table of the case file. `null` in JSON is the same as leaving the key out.
+
+    `owned` has the fields that go with each setting of the `switches`: `...` for one that must be given, else
+    its default. Those that go with another setting only are refused.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    switches: ClassVar[tuple[str, ...]] = ()
+    owned: ClassVar[Mapping[tuple[str, ...], Mapping[str, Any]]] = {(): {}}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, tree: object) -> object:
+        if not isinstance(tree, Mapping):
+            return tree
+        given = {key: value for key, value in tree.items() if value is not None}
+        setting = tuple(str(given.get(switch, cls.model_fields[switch].default)) for switch in cls.switches)
+        defaults = {key: value for key, value in cls.owned.get(setting, {}).items() if value is not ...}
+        return defaults | given
+
+    @model_validator(mode="after")
+    def _fields_fit_switches(self) -> Self:
+        setting = tuple(getattr(self, switch) for switch in self.switches)
+        words = ", ".join(
+            f"{switch} = {value!r}" for switch, value in zip(self.switches, setting, strict=True)
+        )
+        if setting not in self.owned:
+            raise CaseError([Problem(self.switches[-1], setting[-1], f"not possible with {words}")])
+        own = self.owned[setting]
+        names = {name for fields in self.owned.values() for name in fields}
+        given = {name: value for name in sorted(names) if (value := getattr(self, name)) not in (None, ())}
+        missing = [name for name, default in own.items() if default is ... and name not in given]
+        takes = f"does not belong to {words}, which takes {', '.join(own)}"
+        _refuse(
+            [Problem(name, None, f"must be given with {words}{_about(type(self), name)}") for name in missing]
+            + [Problem(name, value, takes) for name, value in given.items() if name not in own]
+        )
+        return self
+
+
+def _about(table: type[BaseModel], field: str) -> str:
+    return f": {table.model_fields[field].description}"
+
+
+# --- tables
+
+
+class Domain(Table):
+    size: Edges
+    """edge lengths, nm; two: 2-D, three: 3-D; the lower corner is the origin"""
+
+
+class Nodes(Table):
+    switches: ClassVar = ("source",)
+    owned: ClassVar = {("lattice",): {"spacing": ...}, ("gmsh",): {"spacing": ...}, ("file",): {"path": ...}}
+
+    source: Literal["lattice", "gmsh", "file"] = "lattice"
+    """lattice: triangular or body-centred, built in; gmsh: meshed by gmsh; file: read by meshio"""
+    spacing: Positive | None = None
+    """h, nm: nodal spacing (lattice, gmsh)"""
+    path: Text | None = None
+    """mesh of triangles or tetrahedra; relative to the case file (file)"""
+
+
+class ShapeFunctions(Table):
+    kind: Literal["lme", "linear"] = "lme"
+    """N_a, eq. (17): local maximum entropy, or linear finite elements on the same mesh"""
+    gamma: Annotated[float, FINITE, Field(ge=0.5, le=6)] = 1.8
+    """gamma [1]: N_a = exp(-gamma |x - x_a|^2 / h^2 + lambda . (x - x_a)) / Z (lme)"""
+    tolerance: Annotated[float, FINITE, Field(gt=0, lt=0.1)] = 1e-6
+    """delta_0 [1]: N_a is dropped where exp(-gamma r^2 / h^2) < delta_0 (lme)"""
+
+
+class Particles(Table):
+    """Spheres (discs in 2-D) or boxes. Fields of another source are absent: None, or an empty tuple."""
+
+    switches: ClassVar = ("source", "shape")
+    owned: ClassVar = {
+        ("list", "sphere"): {"centres": ..., "radii": ...},
+        ("list", "box"): {"centres": ..., "sizes": ...},
+        ("file", "sphere"): {"path": ...},
+        ("packing", "sphere"): {"mean_radius": ..., "std_radius": 0.0, "seed": 0, "container": ...}
+        | {"packing_density": None, "count": None},
+    }
+
+    source: Literal["list", "file", "packing"] = "list"
+    """list: given here; file: a CSV, read into a list at once; packing: drawn and packed before the run"""
+    shape: Literal["sphere", "box"] = "sphere"
+    """box: with source = 'list' only"""
+    centres: tuple[Point, ...] = ()
+    """r(a), nm: a point per particle (list)"""
+    radii: tuple[Positive, ...] = ()
+    """R_a, nm, eq. (34): one per particle (list of spheres)"""
+    sizes: tuple[Edges, ...] = ()
+    """edge lengths, nm: one set per particle (list of boxes)"""
+    path: Text | None = None
+    """CSV of x,y[,z],radius, nm; relative to the case file (file)"""
+    mean_radius: Positive | None = None
+    """mean of the radii, nm (packing)"""
+    std_radius: NonNegative | None = None
+    """standard deviation of the radii, nm (packing; default 0)"""
+    packing_density: Fraction | None = None
+    """solid fraction of the container [1] (packing; this or count)"""
+    count: Annotated[int, Field(strict=True, ge=1)] | None = None
+    """number of particles (packing; this or packing_density)"""
+    seed: Annotated[int, Field(strict=True, ge=0)] | None = None
+    """seed of the random draw (packing; default 0)"""
+    container: Box | None = None
+    """lower and upper corner of the packed box, nm (packing)"""
+    interface_width: Positive = 1.0
+    """xi, nm: eta(a) = (1 - tanh((d_a - R_a) / xi)) / 2 at t = 0, eq. (34)"""
+
+    @model_validator(mode="after")
+    def _counts_agree(self) -> Self:
+        name = "sizes" if self.shape == "box" else "radii"
+        given, n = getattr(self, name), len(self.centres)
+        if self.source == "list" and len(given) != n:
+            raise CaseError([Problem(name, list(given), f"must be {n}, one per centre, not {len(given)}")])
+        if self.source == "packing" and (self.count is None) == (self.packing_density is None):
+            raise CaseError([Problem("packing_density", self.packing_density, "give either this or count")])
+        return self
+
+    def extents(self) -> tuple[Floats, Floats]:
+        """Centres, and half widths along the axes, of a list: both (particles, dim)."""
+        centres = np.array(self.centres, dtype=float)
+        if self.shape == "box":
+            return centres, 0.5 * np.array(self.sizes, dtype=float)
+        return centres, np.repeat(np.array(self.radii, dtype=float)[:, None], centres.shape[1], axis=1)
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper corner of the container of a packing, or of the box around a list: both (dim,)."""
+        if self.container is not None:
+            return np.array(self.container[0]), np.array(self.container[1])
+        centres, half = self.extents()
+        return (centres - half).min(axis=0), (centres + half).max(axis=0)
+
+
+class Model(Table):
+    """Coefficients; the defaults are those of Table 2."""
+
+    A: NonNegative = 16.0
+    """A [1]: double well A rho^2 (1 - rho)^2, eq. (2)"""
+    B: NonNegative = 1.0
+    """B [1]: coupling of rho and eta, eq. (2)"""
+    L: Positive = 10.0
+    """L [1]: boundary mobility, eq. (4)"""
+    kappa_rho: Positive = 10.0
+    """kappa_rho [nm^2]: gradient energy of rho, eq. (1)"""
+    kappa_eta: Positive = 1.0
+    """kappa_eta [nm^2]: gradient energy of eta, eq. (1)"""
+    D_vol: NonNegative = 0.01
+    """D_vol [nm^2]: diffusivity in the solid, eq. (5)"""
+    D_vap: NonNegative = 0.001
+    """D_vap [nm^2]: diffusivity in the vapour, eq. (5)"""
+    D_surf: NonNegative = 4.0
+    """D_surf [nm^2]: diffusivity along surfaces, eq. (5)"""
+    D_gb: NonNegative = 0.4
+    """D_gb [nm^2]: diffusivity along grain boundaries, eq. (5)"""
+    m_t: NonNegative = 500.0
+    """m_t [1]: mobility of translation, eq. (10)"""
+    m_r: NonNegative = 1.0
+    """m_r [1]: mobility of rotation, eq. (10)"""
+    k: NonNegative = 100.0
+    """k [1]: stiffness of the sintering force, eq. (6)"""
+    rho_0: NonNegative = 0.9816
+    """rho_0 [1]: density of a grain boundary at rest, eq. (6)"""
+    c: Fraction = 0.14
+    """c [1]: the force acts where eta(a) eta(b) > c, eq. (7)"""
+    rigid_motion: Flag = True
+    """whether particles move as rigid bodies, eqs. (6)-(11)"""
+    advection: Literal["huang", "wang"] = "huang"
+    """v_adv: sum of eta(a) v(a), eq. (11), or sum of v(a), Wang (2006)"""
+
+
+class Time(Table):
+    switches: ClassVar = ("integrator",)
+    owned: ClassVar = {("adaptive",): {"tolerance": 1e-3}, ("rk2",): {"step": None}}
+
+    end: Positive
+    """t at the end of the run [1]"""
+    integrator: Literal["adaptive", "rk2"] = "adaptive"
+    """adaptive: with error control; rk2: two half Euler steps, eq. (32)"""
+    tolerance: Positive | None = None
+    """error allowed per step [1] (adaptive; default 0.001)"""
+    step: Positive | None = None
+    """dt [1] (rk2; default: the paper's rule, 0.1 d_min^2 / (2 L kappa_eta))"""
+
+
+class Activation(Table):
+    """What a run may skip: material points (section 2.4) and order parameters (section 2.5)."""
+
+    enabled: Flag = True
+    """switch off material points where both gradients are below their bounds, section 2.4"""
+    eps_rho: NonNegative = 1e-5
+    """eps_rho [1/nm]: bound on |grad rho|, section 2.4"""
+    eps_eta: NonNegative = 1e-5
+    """eps_eta [1/nm]: bound on every |grad eta(a)|, section 2.4"""
+    few_order_parameters: Flag = True
+    """store only non-zero eta(a), in shared slots, section 2.5; false: a slot per particle everywhere"""
+
+
+class Every(Table):
+    every: Positive
+    """model time between snapshots [1], from t = 0"""
+
+
+def _form(snapshots: object) -> str:
+    return "|every" if isinstance(snapshots, Mapping | Every) else "|times"
+
+
+Times = Annotated[tuple[NonNegative, ...], Tag("|times")]
+Snapshots = Annotated[Times | Annotated[Every, Tag("|every")], Discriminator(_form)]
+
+
+class Output(Table):
+    """When and where to look. What a case file leaves out is filled in by `Case`, from the other tables."""
+
+    model_config = ConfigDict(json_schema_extra=lambda schema: schema.update(required=[]))
+
+    history_every: Positive
+    """model time between history rows [1] (default: time.end / 100)"""
+    snapshots: Snapshots
+    """increasing times [1] up to time.end, or { every = ... } (default: [0, time.end])"""
+    vacancy_box: Box
+    """corners, nm, of the box of the vacancy ratio R_v (default: the container, or the box around the
+    particles, shrunk to 80 % about its centre)"""
+    checkpoint_every: Positive = 60.0
+    """wall-clock seconds between checkpoints"""
+
+    def snapshot_times(self, end: float) -> tuple[float, ...]:
+        if not isinstance(self.snapshots, Every):
+            return self.snapshots
+        every = self.snapshots.every
+        return tuple(takewhile(lambda t: t <= end * (1 + 1e-12), (k * every for k in count())))
+
+
+class Case(Table):
+    """A resolved case: every default filled in, every file found or read, every check passed."""
+
+    name: Text = "untitled"
+    """free text, without effect on the result"""
+    domain: Domain
+    """the box that is simulated"""
+    nodes: Nodes
+    """where rho and eta are stored"""
+    shape_functions: ShapeFunctions = ShapeFunctions()
+    """how they are interpolated"""
+    particles: Particles
+    """the solid at t = 0"""
+    model: Model = Model()
+    """coefficients, Table 2"""
+    time: Time
+    """how long, and how integrated"""
+    activation: Activation = Activation()
+    """what may be skipped"""
+    output: Output = Field(default_factory=dict, validate_default=True)
+    """what is written, and when"""
+
+    @property
+    def dim(self) -> int:
+        return len(self.domain.size)
+
+    @field_validator("nodes")
+    @classmethod
+    def _find_mesh(cls, nodes: Nodes, info: ValidationInfo) -> Nodes:
+        if nodes.path is None:
+            return nodes
+        path = _absolute(nodes.path, info)
+        if not os.path.isfile(path):
+            raise CaseError([Problem("path", path, "must be a file, and there is none")])
+        return nodes.model_copy(update={"path": path})
+
+    @field_validator("particles")
+    @classmethod
+    def _read_list(cls, particles: Particles, info: ValidationInfo) -> Particles:
+        if particles.path is None or "domain" not in info.data:
+            return particles
+        centres, radii = _read_csv(_absolute(particles.path, info), len(info.data["domain"].size))
+        return Particles(centres=centres, radii=radii, interface_width=particles.interface_width)
+
+    @field_validator("output", mode="before")
+    @classmethod
+    def _fill_in(cls, tree: object, info: ValidationInfo) -> object:
+        """Add the defaults that need other tables; where one of these is refused, any valid value will do."""
+        if not isinstance(tree, Mapping):
+            return tree
+        end = info.data["time"].end if "time" in info.data else 1.0
+        box = _inner_box(info.data.get("domain"), info.data.get("particles"))
+        defaults = {"history_every": end / 100, "snapshots": (0.0, end), "vacancy_box": box}
+        return defaults | {key: value for key, value in tree.items() if value is not None}
+
+    @field_validator("particles", "output")
+    @classmethod
+    def _same_dimension(cls, table: Table, info: ValidationInfo) -> Table:
+        dim = len(info.data["domain"].size) if "domain" in info.data else None
+        _refuse(
+            Problem(f"{field}[{i}]", list(point), f"must be {dim} numbers, as domain.size is")
+            for field in ("centres", "sizes", "container", "vacancy_box")
+            for i, point in enumerate(getattr(table, field, None) or ())
+            if dim is not None and len(point) != dim
+        )
+        return table
+
+    @model_validator(mode="after")
+    def _tables_agree(self) -> Self:
+        listed = (_particles_inside, _particles_apart) if self.particles.source == "list" else ()
+        checks = (*listed, _particles_resolved, _boxes_inside, _times_in_order)
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # absurdly large numbers are refused, not warned of
+            _refuse(problem for check in checks for problem in check(self))
+        return self
+
+    def with_particles(self, centres: ArrayLike, radii: ArrayLike) -> "Case":
+        """The case with spheres, (n, dim) and (n,), for its particles: what a packing turns into."""
+        spheres = {
+            "centres": np.asarray(centres, dtype=float).tolist(),
+            "radii": np.asarray(radii, dtype=float).tolist(),
+            "interface_width": self.particles.interface_width,
+        }
+        return parse_case({**self._tree(), "particles": spheres})
+
+    def _tree(self) -> dict[str, Any]:
+        tree = self.model_dump(mode="json", exclude_none=True)
+        tree["particles"] = {key: value for key, value in tree["particles"].items() if value != []}
+        return tree
+
+    def resolved_json(self) -> str:
+        return json.dumps(self._tree(), indent=2, ensure_ascii=False) + "\n"
+
+    def identity(self) -> str:
+        """SHA-256 of all that changes the result; a mesh file counts by its content, wherever it is."""
+        tree = self._tree()
+        del tree["name"], tree["output"]["checkpoint_every"]
+        if self.nodes.path is not None:
+            tree["nodes"]["path"] = hashlib.sha256(Path(self.nodes.path).read_bytes()).hexdigest()
+        return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
+
+
+# --- checks across tables
+
+
+def _inner_box(domain: Domain | None, particles: Particles | None) -> Box:
+    """The container, or the box around the particles, shrunk to 80 % about its centre, within the domain."""
+    size = np.array(domain.size if domain else (1.0, 1.0))
+    lower, upper = np.zeros_like(size), size
+    if domain and particles:
+        with np.errstate(over="ignore", invalid="ignore"):
+            lower, upper = particles.bounds()
+            margin = 0.1 * (upper - lower)
+            lower, upper = np.clip(lower + margin, 0.0, size), np.clip(upper - margin, 0.0, size)
+    if not (lower < upper).all():  # the particles are refused themselves: they are the problem, not this box
+        lower, upper = np.zeros_like(size), size
+    return tuple(lower.tolist()), tuple(upper.tolist())
+
+
+def _outside(lower: Floats, upper: Floats, case: Case) -> NDArray[np.bool_]:
+    size = np.array(case.domain.size)
+    outside: NDArray[np.bool_] = (lower < -ROUND_OFF * size) | (upper > size * (1 + ROUND_OFF))
+    return np.asarray(outside.any(axis=-1))
+
+
+def _particles_inside(case: Case) -> Iterator[Problem]:
+    centres, half = case.particles.extents()
+    for i in np.flatnonzero(_outside(centres - half, centres + half, case)):
+        allowed = (
+            f"reaches {half[i].tolist()} to each side, must stay in the domain, {list(case.domain.size)}"
+        )
+        yield Problem(f"particles.centres[{i}]", centres[i].tolist(), allowed)
+
+
+def _particles_apart(case: Case) -> Iterator[Problem]:
+    """R_i + R_j - |r_i - r_j| <= min(R_i, R_j) / 2; for boxes along the axis of the least overlap."""
+    centres, half = case.particles.extents()
+    pairs = cKDTree(centres).query_pairs(2 * half.max(), p=np.inf, output_type="ndarray")
+    i, j = pairs[np.lexsort(pairs.T[::-1])].T
+    away, reach = np.abs(centres[i] - centres[j]), half[i] + half[j]
+    boxes = case.particles.shape == "box"
+    shared = (reach - away).min(axis=1) if boxes else reach[:, 0] - np.linalg.norm(away, axis=1)
+    limit = 0.5 * np.minimum(half[i].min(axis=1), half[j].min(axis=1))
+    for p in np.flatnonzero(shared > limit * (1 + ROUND_OFF)):
+        allowed = f"overlaps particles.centres[{i[p]}] by {shared[p]:g} nm, must be at most {limit[p]:g}"
+        yield Problem(f"particles.centres[{j[p]}]", centres[j[p]].tolist(), allowed)
+
+
+def _particles_resolved(case: Case) -> Iterator[Problem]:
+    """h <= the smallest radius or half edge; before a packing is drawn only the mean is known."""
+    spacing, mean = case.nodes.spacing, case.particles.mean_radius
+    smallest = float(case.particles.extents()[1].min()) if mean is None else mean
+    if spacing is not None and spacing > smallest:
+        what = "the smallest radius or half edge" if mean is None else "particles.mean_radius"
+        yield Problem("nodes.spacing", spacing, f"must be at most {what}, {smallest}")
+
+
+def _boxes_inside(case: Case) -> Iterator[Problem]:
+    boxes = {"particles.container": case.particles.container, "output.vacancy_box": case.output.vacancy_box}
+    for key, box in boxes.items():
+        if box is None:
+            continue
+        lower, upper = np.array(box[0]), np.array(box[1])
+        if (lower >= upper).any():
+            yield Problem(
+                key, [*map(list, box)], "must be [lower corner, upper corner], lower along every axis"
+            )
+        elif _outside(lower, upper, case):
+            yield Problem(key, [*map(list, box)], f"must be inside the domain, {list(case.domain.size)}")
+
+
+def _times_in_order(case: Case) -> Iterator[Problem]:
+    end, step, snapshots = case.time.end, case.time.step, case.output.snapshots
+    if step is not None and step > end:
+        yield Problem("time.step", step, f"must be at most time.end, {end}")
+    times = () if isinstance(snapshots, Every) else snapshots
+    for i, t in enumerate(times):
+        if t > end:
+            yield Problem(f"output.snapshots[{i}]", t, f"must be at most time.end, {end}")
+        if i and t <= times[i - 1]:
+            yield Problem(
+                f"output.snapshots[{i}]", t, f"must be greater than the time before, {times[i - 1]}"
+            )
+
+
+# --- reading
+
+
+def case_schema() -> dict[str, Any]:
+    """JSON Schema of a case file; which fields go with which source is in the descriptions only."""
+    return Case.model_json_schema()
+
+
+def load_case(path: Path | str) -> Case:
+    """The case in a TOML or JSON file. Raises `CaseError`."""
+    path = Path(path)
+    readers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": json.loads}
+    if path.suffix not in readers:
+        raise CaseError([Problem(str(path), None, "must end in .toml or .json")])
+    try:
+        tree = readers[path.suffix](path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise CaseError([Problem(str(path), None, f"cannot be read: {error.strerror}")]) from error
+    except (ValueError, RecursionError) as error:
+        raise CaseError(
+            [Problem(str(path), None, f"not valid {path.suffix[1:].upper()}: {error}")]
+        ) from error
+    return parse_case(tree, base=path.parent)
+
+
+def parse_case(tree: Mapping[str, Any], base: Path | None = None) -> Case:
+    """The case in a tree of plain values; relative paths start from `base`. Raises `CaseError`."""
+    try:
+        return Case.model_validate(tree, context={"base": base})
+    except ValidationError as error:
+        raise CaseError(_problems(error)) from None
+
+
+def _absolute(path: str, info: ValidationInfo) -> str:
+    return os.path.abspath(((info.context or {}).get("base") or Path()) / path)
+
+
+def _problems(error: ValidationError) -> Iterator[Problem]:
+    entries = error.errors(include_url=False)
+    inside = {entry["loc"][:-1] for entry in entries}
+    for entry in entries:
+        loc, kind, cause = entry["loc"], entry["type"], entry.get("ctx", {}).get("error")
+        if isinstance(cause, CaseError):
+            yield from (replace(problem, key=_dotted([*loc, problem.key])) for problem in cause.problems)
+        elif kind == "too_short" and loc in inside:
+            continue  # it counts the refused items as lacking
+        elif kind == "missing":
+            about = _about(_table(loc), loc[-1]) if isinstance(loc[-1], str) else ""
+            yield Problem(_dotted(loc), None, f"must be given{about}")
+        else:
+            plain = {"tuple_type": "must be a list", "model_type": "must be a table"}.get(kind)
+            allowed = plain or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
+            yield Problem(_dotted(loc), entry["input"], _known(loc) if kind == "extra_forbidden" else allowed)
+
+
+def _dotted(loc: Key) -> str:
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if str(part)[:1] != "|")
+    return "".join(parts).removeprefix(".") or "case"
+
+
+def _table(loc: Key) -> type[BaseModel]:
+    """The table that holds the key at `loc`."""
+    table: Any = Case
+    for part in loc[:-1]:
+        table = Every if part in ("snapshots", "|every") else table.model_fields[part].annotation
+    return table  # type: ignore[no-any-return]
+
+
+def _known(loc: Key) -> str:
+    known = list(_table(loc).model_fields)
+    close = difflib.get_close_matches(str(loc[-1]), known, n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    return f"unknown key; allowed here: {', '.join(known)}{hint}"
+
+
+def _read_csv(path: str, dim: int) -> tuple[tuple[Point, ...], tuple[float, ...]]:
+    """Centres and radii. Blank lines, lines that start with # and a header `x,y[,z],radius` are skipped."""
+    names = [*"xyz"[:dim], "radius"]
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise CaseError([Problem("path", path, f"cannot be read: {error}")]) from error
+    table = [
+        (number, [cell.strip() for cell in line.split(",")]) for number, line in enumerate(lines, start=1)
+    ]
+    table = [(number, cells) for number, cells in table if cells != [""] and not cells[0].startswith("#")]
+    if table and [cell.lower() for cell in table[0][1]] == names:
+        del table[0]
+    wrong = [text for number, cells in table for text in _wrong_cells(number, cells, names)]
+    _refuse(Problem("path", path, text) for text in (wrong if table else ["holds no particles"]))
+    rows = [tuple(map(float, cells)) for _, cells in table]
+    return tuple(row[:-1] for row in rows), tuple(row[-1] for row in rows)
+
+
+def _wrong_cells(line: int, cells: Sequence[str], names: Sequence[str]) -> Iterator[str]:
+    if len(cells) != len(names):
+        yield f"line {line} has {len(cells)} columns, must have {len(names)}: {','.join(names)}"
+        return
+    for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
+        try:
+            good = 0 < float(cell) < math.inf if name == "radius" else math.isfinite(float(cell))
+        except ValueError:
+            good = False
+        if not good:
+            allowed = "a number greater than 0" if name == "radius" else "a number"
+            yield f"line {line}, column {column} ({name}) is {cell!r}, must be {allowed}"

@@ -1,0 +1,97 @@
+"""checkpoint.h5: the last complete state of a run, replaced atomically; resuming continues the same run."""
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from .geometry import Mesh
+from .partition import Collector
+from .scheme import Scheme
+from .state import State
+
+NAME = "checkpoint.h5"
+FORMAT = 1
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint that cannot be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A state on all nodes, and the state in which the live points were last chosen.
+
+    Choosing them again at `reference` and going on from `state` repeats what an uninterrupted run does.
+    """
+
+    state: State
+    reference: State
+    memory: dict[str, float]
+    wall_time: float
+
+
+def write(
+    directory: Path, scheme: Scheme, state: State, collector: Collector, mesh: Mesh, notes: dict[str, Any]
+) -> None:
+    """Collective; rank 0 writes beside the old file, makes it durable, and renames. notes: identity, memory, wall_time."""
+    fields = {
+        "u": collector.whole(state.u),
+        "owner": collector.whole(state.owner),
+        "reference": collector.whole(scheme.active.reference),
+    }
+    if not scheme.d.share.ranks.root:
+        return
+    fields["slot_of"] = state.slot_of
+    beside = directory / (NAME + ".new")
+    with h5py.File(beside, "w") as file:
+        for name, values in fields.items():
+            file[name] = values
+        file["u"].attrs["columns"] = "rho, then slots of eta; owner[:, s] is the particle of column 1 + s, -1: none"
+        file.attrs.update(format=FORMAT, time=state.time, step=state.step, evaluations=state.evaluations)
+        file.attrs.update(nodes=len(mesh.nodes), mesh=mesh_hash(mesh), notes=json.dumps(notes))
+    replace_durably(beside, directory / NAME)
+
+
+def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
+    """The checkpoint of a run directory; CheckpointError where it belongs to another case or mesh."""
+    path = directory / NAME
+    try:
+        with h5py.File(path) as file:
+            values = {name: file[name][...] for name in ("u", "owner", "reference", "slot_of")}
+            attributes = dict(file.attrs)
+    except (OSError, KeyError) as error:
+        raise CheckpointError(f"{path}: cannot be read as a checkpoint: {error}") from error
+    if attributes["format"] != FORMAT:
+        raise CheckpointError(f"{path}: format {attributes['format']}, this frit reads format {FORMAT}")
+    notes = json.loads(attributes["notes"])
+    if notes["identity"] != identity:
+        raise CheckpointError(f"{path}: belongs to another case than case.json")
+    if attributes["mesh"] != mesh_hash(mesh):
+        raise CheckpointError(f"{path}: the mesh has changed since: {attributes['nodes']} nodes then, {len(mesh.nodes)} now")
+    counts = float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])
+    state = State(*counts, values["u"], values["owner"], values["slot_of"])
+    reference = State(*counts, values["reference"], values["owner"], values["slot_of"])
+    return Checkpoint(state, reference, notes["memory"], notes["wall_time"])
+
+
+def mesh_hash(mesh: Mesh) -> str:
+    """A fingerprint of the nodes and cells."""
+    return hashlib.sha256(np.ascontiguousarray(mesh.nodes).tobytes() + mesh.cells.tobytes()).hexdigest()
+
+
+def replace_durably(beside: Path, path: Path) -> None:
+    """Make a finished file durable and put it in the place of the old one: a reader sees the one or the other."""
+    with open(beside, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(beside, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -1,0 +1,120 @@
+"""One rank's nodes, material points and shape functions: all that does not change during a run."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .case import Case
+from .energy import Coefficients
+from .geometry import Mesh
+from .partition import Halo, Ranks, Share, bisect
+from .shape import ShapeError, ShapeTable, linear, lme, search_range
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """x (p, dim) are the points' positions measured from the centre of the domain, in nm."""
+
+    case: Case
+    share: Share
+    shape: ShapeTable
+    positions: Floats  # (n, dim) of this rank's nodes, nm
+    x: Floats  # (p, dim)
+    weights: Floats  # (p,) nm^dim
+    mass: Floats  # (n,) m_a = sum_p w_p N_a(x_p) over all ranks   (22)
+    first_moment: Floats  # (n, dim) q_a = sum_p w_p x_p N_a(x_p) over all ranks
+    coefficients: Coefficients
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self.x.shape[1]
+
+    @property
+    def nodes(self) -> int:
+        """The number of nodes that this rank holds."""
+        return len(self.positions)
+
+    @property
+    def huang(self) -> bool:
+        """Whether v_adv = sum eta_a v_a (11); else Wang's v_adv = sum v_a."""
+        return self.case.model.advection == "huang"
+
+
+def shape_table(
+    case: Case, points: Floats, spacing: Floats, cells: NDArray[np.int32], nodes: Floats, tree: cKDTree | None = None
+) -> ShapeTable:
+    """The shape functions that the case asks for, at points in the given cells; tree: of the nodes, if it exists."""
+    given = case.shape_functions
+    if given.kind == "linear":
+        return linear(points, cells, nodes)
+    return lme(points, spacing, nodes, given.gamma, given.tolerance, tree)
+
+
+def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discretisation:
+    """This rank's share of the mesh; `activity` (p,) > 0 is the expected work of each point. Collective."""
+    part = bisect(mesh.points, activity, ranks.size)
+    points = np.flatnonzero(part == ranks.rank)
+    table = shape_table(case, mesh.points[points], mesh.spacing[points], mesh.cells[points], mesh.nodes)
+    seen = np.zeros(len(mesh.nodes), dtype=bool)
+    seen[table.nodes] = True
+    nodes = np.flatnonzero(seen)
+    local = np.full(len(mesh.nodes), -1, dtype=np.int32)
+    local[nodes] = np.arange(nodes.size, dtype=np.int32)
+    table = ShapeTable(table.offsets, local[table.nodes], table.table)
+    share = Share(ranks, points, nodes, Halo(ranks, nodes), len(mesh.nodes))
+    x = mesh.points[points] - 0.5 * np.asarray(case.domain.size)
+    weights = np.ascontiguousarray(mesh.weights[points])
+    mass, first_moment = _moments(table, weights, x, nodes.size)
+    share.halo.add(mass)
+    share.halo.add(first_moment)
+    _check_mass(mesh, share, mass)
+    return Discretisation(
+        case, share, table, mesh.nodes[nodes], x, weights, mass, first_moment,
+        Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
+    )
+
+
+def _moments(table: ShapeTable, weights: Floats, x: Floats, nodes: int) -> tuple[Floats, Floats]:
+    """This rank's parts of m_a and q_a."""
+    counts = np.diff(table.offsets)
+    wN = np.repeat(weights, counts) * table.table[:, 0]
+    mass = np.bincount(table.nodes, wN, minlength=nodes)
+    moment = [np.bincount(table.nodes, wN * np.repeat(x[:, k], counts), minlength=nodes) for k in range(x.shape[1])]
+    return mass, np.stack(moment, axis=1)
+
+
+def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:
+    """Every node must be seen by some point with a weight worth the name."""
+    held = np.zeros(share.total)
+    held[share.nodes] = mass
+    share.ranks.max(held)
+    if not (held > 0.0).all():
+        a = int(np.argmin(held))
+        raise ShapeError(
+            f"node {a} at {np.array2string(mesh.nodes[a], precision=6)} nm is in range of no material point: "
+            "its volume m_a is 0"
+        )
+
+
+def ring(case: Case, mesh: Mesh) -> float:
+    """How far one evaluation carries a value, nm: twice the farthest that a point sees."""
+    given = case.shape_functions
+    if given.kind == "lme":
+        return 2.0 * float(search_range(mesh.spacing, given.gamma, given.tolerance).max())
+    corners = mesh.nodes[mesh.cells] - mesh.points[:, None, :]
+    return 2.0 * float(np.linalg.norm(corners, axis=2).max())
+
+
+def activity(mesh: Mesh, u: Floats, eps: float) -> Floats:
+    """Expected work of each point (p,): 1 where a field varies over its cell by more than eps per nm, else 0.05."""
+    varies = np.zeros(len(mesh.cells), dtype=bool)
+    for column in u.T:
+        if column.any():
+            corner = column[mesh.cells]
+            varies |= corner.max(axis=1) - corner.min(axis=1) > eps * mesh.spacing
+    return np.where(varies, 1.0, 0.05)

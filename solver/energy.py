@@ -1,0 +1,59 @@
+"""The free energy, its derivatives and the mobility: scalar functions that read like the paper.
+
+Every function takes point values: rho, the sums S2 = sum eta^2 and S3 = sum eta^3, and the model's coefficients `m`.
+Source: Huang et al. (2023), equations (2), (5), (30), (31); Wang (2006).
+"""
+
+from typing import NamedTuple
+
+from .jit import jit
+
+
+class Coefficients(NamedTuple):
+    """Table 2 in the order of the case file; a named tuple because numba compiles attribute access to it."""
+
+    A: float
+    B: float
+    L: float
+    kappa_rho: float
+    kappa_eta: float
+    D_vol: float
+    D_vap: float
+    D_surf: float
+    D_gb: float
+    m_t: float
+    m_r: float
+    k: float
+    rho_0: float
+    c: float
+
+
+@jit
+def free_energy_density(rho: float, S2: float, S3: float, m: Coefficients) -> float:
+    """f = A rho^2 (1 - rho)^2 + B [ rho^2 + 6 (1 - rho) S2 - 4 (2 - rho) S3 + 3 S2^2 ]   (2)"""
+    wells = m.A * rho**2 * (1.0 - rho) ** 2
+    return wells + m.B * (rho**2 + 6.0 * (1.0 - rho) * S2 - 4.0 * (2.0 - rho) * S3 + 3.0 * S2**2)
+
+
+@jit
+def df_drho(rho: float, S2: float, S3: float, m: Coefficients) -> float:
+    """df/drho = A (4 rho^3 - 6 rho^2 + 2 rho) + B (2 rho - 6 S2 + 4 S3)   (31)"""
+    return m.A * rho * (2.0 + rho * (4.0 * rho - 6.0)) + m.B * (2.0 * rho - 6.0 * S2 + 4.0 * S3)
+
+
+@jit
+def df_deta(eta: float, rho: float, S2: float, m: Coefficients) -> float:
+    """df/deta_a = 12 B [ (1 - rho) eta_a - (2 - rho) eta_a^2 + eta_a S2 ]   (30)"""
+    return 12.0 * m.B * eta * ((1.0 - rho) - (2.0 - rho) * eta + S2)
+
+
+@jit
+def mobility(rho: float, overlap: float, m: Coefficients) -> float:
+    """D = D_vol phi + D_vap (1 - phi) + D_surf rho (1 - rho) + D_gb sum_a sum_{b != a} eta_a eta_b   (5)
+
+    phi = rho^3 (10 - 15 rho + 6 rho^2). `overlap` is the double sum over ordered pairs. A diffuse model leaves [0, 1] by
+    a little, where D would turn negative: D sees rho clamped to [0, 1] and the overlap clamped to >= 0.
+    """
+    r = min(max(rho, 0.0), 1.0)
+    phi = r**3 * (10.0 - 15.0 * r + 6.0 * r**2)
+    return m.D_vol * phi + m.D_vap * (1.0 - phi) + m.D_surf * r * (1.0 - r) + m.D_gb * max(overlap, 0.0)

@@ -1,0 +1,259 @@
+"""Steps in time: `rk2` as the paper prints it, and `adaptive`, a stabilised Runge-Kutta-Chebyshev method.
+
+An integrator sees the problem only through `Scheme.rates` and the list of nodes that change. It owns its work arrays;
+`memory` holds what a checkpoint needs so that a resumed run takes the same steps.
+"""
+
+from math import ceil, sqrt
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels
+from .case import Case
+from .partition import Ranks
+from .scheme import Scheme
+from .state import State
+
+Floats = NDArray[np.float64]
+
+
+class Integrator(Protocol):
+    """What the run needs of a method."""
+
+    stops_at_events: bool  # whether a step must end at each output time, or `at` interpolates
+
+    def step(self, scheme: Scheme, state: State, limit: float) -> None:
+        """Advance the state by one step, not beyond `limit`."""
+
+    def at(self, scheme: Scheme, state: State, time: float) -> Floats:
+        """The fields (n, F) at a time within the last step; valid until the next call."""
+
+    def restart(self, scheme: Scheme, state: State) -> None:
+        """The set of live points or the layout of the slots has changed."""
+
+    @property
+    def memory(self) -> dict[str, float]:
+        """Numbers to keep in a checkpoint."""
+
+
+def paper_step(shortest: float, case: Case) -> float:
+    """dt = 0.1 d_min^2 / (2 L kappa_eta), d_min the smallest distance between nodes: the paper's rule (2.3)."""
+    return 0.1 * shortest**2 / (2.0 * case.model.L * case.model.kappa_eta)
+
+
+class RK2:
+    """Two half Euler steps (32): u' = u + dt/2 F(u), then u' + dt/2 F(u'). First order, stable for dt |lambda| < 4."""
+
+    stops_at_events = True
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self.rate = np.empty((0, 0))
+
+    def step(self, scheme: Scheme, state: State, limit: float) -> None:
+        """One step of the equal steps, at most dt, that lead to the limit."""
+        remaining = limit - state.time
+        count = max(1, ceil(remaining / self.dt - 1e-9))
+        dt = remaining / count
+        nodes = scheme.active.nodes
+        for _ in range(2):
+            scheme.rates(state.u, self.rate)
+            kernels.advance(state.u, state.u, 0.5 * dt, self.rate, nodes)
+        state.evaluations += 2
+        state.time = limit if count == 1 else state.time + dt
+        state.step += 1
+
+    def at(self, scheme: Scheme, state: State, time: float) -> Floats:
+        """Every output time ends a step: the fields themselves."""
+        return state.u
+
+    def restart(self, scheme: Scheme, state: State) -> None:
+        """Only the shape of the work array can change."""
+        if self.rate.shape != state.u.shape:
+            self.rate = np.zeros_like(state.u)
+
+    @property
+    def memory(self) -> dict[str, float]:
+        """Nothing: the step is fixed."""
+        return {}
+
+
+SAFETY = 0.8
+GROWTH = 5.0  # largest factor between two steps
+SHRINK = 0.1
+MOST_STAGES = 200
+ESTIMATE_EVERY = 25  # accepted steps between two estimates of the spectral radius
+MARGIN = 1.2  # factor on an estimate of the spectral radius
+
+
+class Chebyshev:
+    """Runge-Kutta-Chebyshev of order 2 with error control (Sommeijer, Shampine & Verwer 1997).
+
+    s stages are stable for dt |lambda| < 0.65 s^2 on the negative real axis: the cost of a step grows with the square root of its
+    length. The error of a step is estimated from its end points; steps aim at `tolerance` in the volume-weighted root
+    mean square of e / (1 + |u|) over the nodes that change.
+    """
+
+    stops_at_events = False
+
+    def __init__(self, tolerance: float, memory: dict[str, float] | None = None) -> None:
+        self.tolerance = tolerance
+        kept = memory or {}
+        self.dt = kept.get("dt", 0.0)
+        self.radius = kept.get("radius", 0.0)
+        self.age = kept.get("age", 0.0)
+        self.error_before = kept.get("error_before", 0.0)
+        self.dt_before = kept.get("dt_before", 0.0)
+        self.work: list[Floats] = []
+        self.old = self.rate_0 = self.rate_1 = np.empty((0, 0))
+        self.fresh = False  # whether rate_1 is F(state.u)
+        self.start = 0.0
+
+    @property
+    def memory(self) -> dict[str, float]:
+        """The step that comes next, and the spectral radius."""
+        return {
+            "dt": self.dt, "radius": self.radius, "age": self.age,
+            "error_before": self.error_before, "dt_before": self.dt_before,
+        }  # fmt: skip
+
+    def restart(self, scheme: Scheme, state: State) -> None:
+        """Fit the work arrays to the state and forget the last rate."""
+        if self.old.shape != state.u.shape:
+            self.work = [np.zeros_like(state.u) for _ in range(4)]
+            self.old, self.rate_0, self.rate_1 = (np.zeros_like(state.u) for _ in range(3))
+        for array in self.work:
+            array[:] = state.u
+        self.fresh = False
+
+    def step(self, scheme: Scheme, state: State, limit: float) -> None:
+        """Try steps until one is accepted."""
+        nodes = scheme.active.nodes
+        kernels.start(self.old, state.u, nodes)
+        if self.fresh:
+            self.rate_0, self.rate_1 = self.rate_1, self.rate_0
+        else:
+            scheme.rates(state.u, self.rate_0)
+            state.evaluations += 1
+        if self.radius == 0.0 or self.age >= ESTIMATE_EVERY:
+            self._estimate(scheme, state)
+        if self.dt == 0.0:
+            self.dt = 0.1 / self.radius
+        while True:
+            dt = self._fit(limit - state.time)
+            error = self._try(scheme, state, dt)
+            if error <= 1.0:
+                break
+            self.dt = dt * max(SHRINK, SAFETY * error ** (-1.0 / 3.0)) if np.isfinite(error) else 0.1 * dt
+            self._estimate(scheme, state)
+            if not self.dt > 1e-12 * max(limit, 1.0):
+                raise FloatingPointError(f"step size fell to {self.dt:.1e} at t = {state.time:.6g}")
+        self._accept(state, dt, error, limit)
+
+    def at(self, scheme: Scheme, state: State, time: float) -> Floats:
+        """The cubic Hermite interpolant of the last step: of higher order than the method."""
+        dt = state.time - self.start
+        theta = (time - self.start) / dt
+        kernels.start(self.work[0], state.u, np.arange(len(state.u)))
+        kernels.hermite(
+            self.work[0], self.old, self.rate_0, state.u, self.rate_1, dt, theta, scheme.active.nodes
+        )
+        return self.work[0]
+
+    def _fit(self, remaining: float) -> float:
+        """The next step: at most what `MOST_STAGES` can do, and no sliver left before the limit."""
+        dt = min(self.dt, 0.65 * (MOST_STAGES - 1) ** 2 / self.radius)
+        if dt >= remaining * (1.0 - 1e-9):
+            return remaining
+        return min(dt, 0.5 * remaining) if dt > 0.5 * remaining else dt
+
+    def _try(self, scheme: Scheme, state: State, dt: float) -> float:
+        """Fill state.u with the new fields and rate_1 with their rate; the error in units of the tolerance."""
+        nodes = scheme.active.nodes
+        stages = max(2, 1 + int(sqrt(1.0 + 1.54 * dt * self.radius)))
+        before, last, new, rate = self.work
+        kernels.start(before, self.old, nodes)
+        for j, c in enumerate(coefficients(stages, dt), start=1):
+            if j == 1:
+                kernels.advance(last, self.old, c[4], self.rate_0, nodes)
+                continue
+            scheme.rates(last, rate)
+            kernels.chebyshev_stage(new, self.old, before, last, rate, self.rate_0, c, nodes)
+            before, last, new = last, new, before
+        kernels.start(state.u, last, nodes)
+        scheme.rates(state.u, self.rate_1)
+        state.evaluations += stages
+        sums = np.array([0.0, float(scheme.d.mass[scheme.active.owned].sum())])
+        sums[0] = kernels.chebyshev_error(
+            state.u, self.old, self.rate_1, self.rate_0, dt, scheme.d.mass, self.tolerance, scheme.active.owned
+        )
+        scheme.d.share.ranks.sum(sums)
+        return float(np.sqrt(sums[0] / sums[1])) if sums[1] > 0.0 else 0.0
+
+    def _accept(self, state: State, dt: float, error: float, limit: float) -> None:
+        error = max(error, 1e-10)
+        factor = SAFETY * error ** (-1.0 / 3.0)
+        if self.error_before > 0.0:
+            factor = min(factor, factor * dt / self.dt_before * (self.error_before / error) ** (1.0 / 3.0))
+        self.error_before, self.dt_before = error, dt
+        self.start = state.time
+        state.time = limit if dt == limit - state.time else state.time + dt
+        state.step += 1
+        self.dt = max(self.dt, dt) if dt < self.dt and factor >= 1.0 else dt * min(max(factor, SHRINK), GROWTH)
+        self.age += 1
+        self.fresh = True
+
+    def _estimate(self, scheme: Scheme, state: State) -> None:
+        """Spectral radius of the Jacobian by the nonlinear power method, started from the rate itself."""
+        nodes, ranks = scheme.active.nodes, scheme.d.share.ranks
+        moved, direction, _, rate = self.work
+        size = sqrt(_total(ranks, kernels.squares(self.old, scheme.active.owned)))
+        length = sqrt(_total(ranks, kernels.squares(self.rate_0, scheme.active.owned)))
+        if length == 0.0:
+            self.radius, self.age = 1.0, 0
+            return
+        delta = 1e-7 * max(size, 1.0)
+        kernels.start(direction, self.rate_0, nodes)
+        radius = 0.0
+        for _ in range(50):
+            kernels.advance(moved, self.old, delta / length, direction, nodes)
+            scheme.rates(moved, rate)
+            state.evaluations += 1
+            kernels.difference(direction, rate, self.rate_0, 1.0, nodes)
+            length = sqrt(_total(ranks, kernels.squares(direction, scheme.active.owned)))
+            previous, radius = radius, length / delta
+            if abs(radius - previous) <= 0.01 * radius or length == 0.0:
+                break
+        self.radius, self.age = max(MARGIN * radius, 1.0), 0
+
+
+def _total(ranks: Ranks, value: float) -> float:
+    return float(ranks.sum(np.array([value]))[0])
+
+
+def coefficients(stages: int, dt: float) -> Floats:
+    """Rows c (stages, 5) of Y_j = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0; row 0 is Y_1 = Y_0 + c_4 F_0.
+
+    From Chebyshev polynomials at w_0 = 1 + (2/13) / s^2, damped so that the stability region is a strip (RKC, eq. 2.6).
+    """
+    w0 = 1.0 + 2.0 / (13.0 * stages**2)
+    T, dT, ddT = np.zeros((3, stages + 1))
+    T[:2], dT[1] = (1.0, w0), 1.0
+    for j in range(2, stages + 1):
+        T[j] = 2.0 * w0 * T[j - 1] - T[j - 2]
+        dT[j] = 2.0 * T[j - 1] + 2.0 * w0 * dT[j - 1] - dT[j - 2]
+        ddT[j] = 4.0 * dT[j - 1] + 2.0 * w0 * ddT[j - 1] - ddT[j - 2]
+    w1 = dT[stages] / ddT[stages]
+    b = np.empty(stages + 1)
+    b[2:] = ddT[2:] / dT[2:] ** 2
+    b[0], b[1] = b[2], 1.0 / w0
+    a = 1.0 - b * T
+    c = np.zeros((stages, 5))
+    c[0, 4] = dt * b[1] * w1
+    for j in range(2, stages + 1):
+        mu, nu = 2.0 * b[j] * w0 / b[j - 1], -b[j] / b[j - 2]
+        mu_rate = 2.0 * b[j] * w1 / b[j - 1]
+        c[j - 1] = 1.0 - mu - nu, mu, nu, dt * mu_rate, -dt * a[j - 1] * mu_rate
+    return c

@@ -1,0 +1,42 @@
+"""How frit compiles its loops: one decorator, one cache that cannot go stale.
+
+numba keeps compiled code beside the source file and looks only at that file's time stamp, so a kernel that calls a
+function of another file would keep the old callee after an edit. frit therefore names its cache folder after the
+content of every solver file that holds compiled code: an edit to any of them opens a fresh folder.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+COMPILED = (
+    "simd.py", "energy.py", "kernels.py", "shape.py", "clip.py", "slots.py", "jit.py",
+)
+
+# Reassociation, contraction and reciprocals, but NaN and infinity keep their meaning: a bad state must be seen.
+FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+
+
+def cache_folder() -> Path:
+    """The folder of the compiled code: `FRIT_CACHE_DIR` or the user's cache, then a hash of the compiled sources."""
+    here = Path(__file__).parent
+    digest = hashlib.sha256(numba.__version__.encode())
+    for name in COMPILED:
+        if (here / name).exists():
+            digest.update((here / name).read_bytes())
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "frit"
+    return Path(os.environ.get("FRIT_CACHE_DIR", default)) / digest.hexdigest()[:16]
+
+
+numba.config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def jit(function: Function) -> Function:
+    """Compile a module-level function of arrays and scalars: cached, division by zero gives infinity, no Python."""
+    return cast(Function, numba.njit(cache=True, fastmath=FASTMATH, error_model="numpy")(function))

@@ -1,0 +1,182 @@
+"""The run directory: run.json, history.jsonl and snapshots.zarr."""
+
+import fcntl
+import json
+import os
+import warnings
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .case import Case
+from .checkpoint import replace_durably
+from .geometry import Mesh
+from .partition import Collector, Ranks
+from .state import State
+
+Floats = NDArray[np.float64]
+
+BLOCK = 65_536  # nodes per chunk of a snapshot
+
+
+class DirectoryError(ValueError):
+    """A run directory that cannot be used; the message says why."""
+
+
+def write_json(path: Path, tree: Any) -> None:
+    """Write beside, make durable, rename."""
+    beside = path.with_name(path.name + ".new")
+    beside.write_text(json.dumps(tree, indent=2) + "\n")
+    replace_durably(beside, path)
+
+
+def now() -> str:
+    """The time of day in UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def lock(directory: Path) -> None:
+    """Hold the run directory until this process ends; DirectoryError where another one holds it."""
+    handle = os.open(directory / "lock", os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        raise DirectoryError(f"{directory}: another process is running here") from error
+
+
+class History:
+    """history.jsonl, appended by rank 0: one line per row, each written with one call and flushed."""
+
+    def __init__(self, directory: Path, after: float | None = None) -> None:
+        """after: keep the rows up to this time (a resumed run writes later ones again); None: start anew."""
+        self.path = directory / "history.jsonl"
+        kept = [] if after is None else [line for line in self._lines() if json.loads(line)["time"] <= after]
+        beside = self.path.with_name("history.jsonl.new")
+        beside.write_text("".join(kept))
+        replace_durably(beside, self.path)
+        self.file = open(self.path, "a", buffering=1)  # noqa: SIM115  (open as long as the run)
+
+    def _lines(self) -> list[str]:
+        """The complete lines; a torn last one is not complete."""
+        if not self.path.exists():
+            return []
+        return [line for line in self.path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Add a row."""
+        self.file.write(json.dumps(row, allow_nan=False) + "\n")
+
+    def sync(self) -> None:
+        """Make all rows durable: before a checkpoint that counts on them."""
+        os.fsync(self.file.fileno())
+
+    def close(self) -> None:
+        """Make all rows durable and close."""
+        self.sync()
+        self.file.close()
+
+
+class Snapshots:
+    """snapshots.zarr, zarr v3: every rank writes the chunks of its block of nodes.
+
+    A snapshot becomes visible at once: its chunks are written while the arrays still end before it, then the arrays
+    grow, and last the group's consolidated metadata is replaced. Readers that use it (zarr and xarray do) see the arrays
+    before or after, never between; `time` grows last for all others.
+    """
+
+    def __init__(self, directory: Path, case: Case, mesh: Mesh, collector: Collector, fresh: bool) -> None:
+        """Collective. fresh: make the group anew; else go on with the one that is there."""
+        self.path, self.collector, self.ranks = directory / "snapshots.zarr", collector, collector.share.ranks
+        if self.ranks.root and fresh:
+            create_group(self.path, case, mesh, collector.block)
+        self.ranks.barrier()
+
+    def write(self, number: int, time: float, state: State, u: Floats) -> None:
+        """Write snapshot `number` (again, where a resumed run passes it again). Collective."""
+        particle, eta_squared = owners(u, state)
+        values = {"rho": u[:, 0], "eta_squared": eta_squared, "particle": particle}
+        first, last = self.collector.first, self.collector.last
+        for name, local in values.items():
+            block = self.collector.blocks(np.ascontiguousarray(local))
+            if last > first:
+                grown(self.path, name, number + 1)[number, first:last] = block
+        self.ranks.barrier()
+        if self.ranks.root:
+            self._publish(number, time)
+        self.ranks.barrier()
+
+    def _publish(self, number: int, time: float) -> None:
+        import zarr
+
+        group = zarr.open_group(self.path, mode="r+", use_consolidated=False)
+        if group["time"].shape[0] > number:
+            return
+        grown(self.path, "time", number + 1)[number] = time
+        for name in ("rho", "eta_squared", "particle", "time"):
+            array = group[name]
+            array.resize((number + 1, *array.shape[1:]))
+        consolidate(self.path)
+
+
+def owners(u: Floats, state: State) -> tuple[NDArray[np.int32], Floats]:
+    """For each node: the particle with the largest eta where rho >= 1/2, else -1; and sum eta^2."""
+    eta = u[:, 1:]
+    slot = eta.argmax(axis=1)
+    particle = np.take_along_axis(state.owner, slot[:, None], axis=1)[:, 0]
+    return np.where(u[:, 0] >= 0.5, particle, -1).astype(np.int32), (eta**2).sum(axis=1)
+
+
+def create_group(path: Path, case: Case, mesh: Mesh, block: int) -> None:
+    """An empty group with the positions of the nodes."""
+    import zarr
+
+    group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"name": case.name, "length_unit": "nm"})
+    count, dim = mesh.nodes.shape
+    nodes = group.create_array(
+        "nodes", shape=(count, dim), chunks=(block, dim), dtype="float64", dimension_names=("node", "axis"),
+        attributes={"units": "nm", "long_name": "position of the node"},
+    )  # fmt: skip
+    nodes[:] = mesh.nodes
+    group.create_array(
+        "time", shape=(0,), chunks=(1,), dtype="float64", dimension_names=("time",),
+        attributes={"units": "1", "long_name": "model time"}, fill_value=np.nan,
+    )  # fmt: skip
+    described = {
+        "rho": ("float64", np.nan, "concentration: 1 solid, 0 vacancy"),
+        "eta_squared": ("float64", np.nan, "sum of the squared order parameters"),
+        "particle": ("int32", -1, "number of the particle that owns the node, -1: vacancy"),
+    }
+    for name, (kind, fill, words) in described.items():
+        group.create_array(
+            name, shape=(0, count), chunks=(1, block), dtype=kind, dimension_names=("time", "node"),
+            attributes={"units": "1", "long_name": words}, fill_value=fill,
+        )  # fmt: skip
+    consolidate(path)
+
+
+def grown(path: Path, name: str, length: int) -> Any:
+    """The array with room for `length` snapshots, in this process alone: what is stored still has its old shape."""
+    import zarr
+    from zarr.core.array import AsyncArray
+
+    stored = zarr.open_array(path, path=name, mode="r+")._async_array
+    shape = (max(length, stored.shape[0]), *stored.shape[1:])
+    return zarr.Array(AsyncArray(stored.metadata.update_shape(shape), stored.store_path))
+
+
+def consolidate(path: Path) -> None:
+    """Replace the group's consolidated metadata: the one file that decides what a reader sees."""
+    import zarr
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
+        zarr.consolidate_metadata(path)
+
+
+def block_size(nodes: int, ranks: Ranks) -> int:
+    """Nodes per chunk: at most BLOCK, and at least one chunk per rank where there are nodes enough."""
+    return max(1, min(BLOCK, -(-nodes // ranks.size)))

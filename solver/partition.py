@@ -1,0 +1,215 @@
+"""Who owns which points and nodes, and how ranks speak to each other. Nothing else in frit imports MPI.
+
+Points are divided by recursive coordinate bisection of their weights. A rank holds every node that its points see;
+nodes held by several ranks are *shared*: each rank sums its own points' shares there, `Halo.add` exchanges these
+partial sums, and every holder adds them in the order of the ranks, so that all hold the same bits. Sums over nodes
+count a node on its *owner*, the lowest rank that holds it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mpi4py
+import numpy as np
+from numpy.typing import NDArray
+
+mpi4py.rc.threads = False
+from mpi4py import MPI  # noqa: E402  (after the settings above)
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Array = NDArray[Any]
+
+
+class Ranks:
+    """A communicator with the few collective operations that frit needs; every one is free on a single rank."""
+
+    def __init__(self, communicator: "MPI.Intracomm | None" = None) -> None:
+        self.comm = MPI.COMM_SELF if communicator is None else communicator
+        self.rank: int = self.comm.Get_rank()
+        self.size: int = self.comm.Get_size()
+
+    @classmethod
+    def world(cls) -> "Ranks":
+        """All ranks that mpirun started."""
+        return cls(MPI.COMM_WORLD)
+
+    @property
+    def root(self) -> bool:
+        """Whether this is rank 0, the one that writes histories and checkpoints."""
+        return self.rank == 0
+
+    def sum(self, array: Floats) -> Floats:
+        """Sum over the ranks, in place."""
+        if self.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, array, MPI.SUM)
+        return array
+
+    def max(self, array: Floats) -> Floats:
+        """Maximum over the ranks, in place."""
+        if self.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, array, MPI.MAX)
+        return array
+
+    def everyones(self, array: Array) -> list[Array]:
+        """Each rank's array, on every rank. For set-up and rare events: arrays travel as Python objects."""
+        return self.comm.allgather(array) if self.size > 1 else [array]
+
+    def from_root(self, thing: Any) -> Any:
+        """Rank 0's object on every rank. For set-up and rare events."""
+        return self.comm.bcast(thing) if self.size > 1 else thing
+
+    def barrier(self) -> None:
+        """Wait for everyone."""
+        if self.size > 1:
+            self.comm.Barrier()
+
+    def abort(self, status: int) -> None:
+        """End every rank at once."""
+        MPI.COMM_WORLD.Abort(status)
+
+
+def mpi_library() -> str:
+    """The name and version of the MPI library, one line."""
+    return MPI.Get_library_version().split("\n")[0].strip("\x00 ")
+
+
+def bisect(points: Floats, weights: Floats, parts: int) -> Integers:
+    """The part (0 ... parts - 1) of each point: cut at the weighted median across the longest side, and again.
+
+    points (p, dim), weights (p,) > 0. Parts differ in weight by about one point; the result is the same everywhere.
+    """
+    part = np.zeros(len(points), dtype=np.int64)
+    todo = [(np.arange(len(points)), 0, parts)]
+    while todo:
+        chosen, first, count = todo.pop()
+        if count == 1:
+            part[chosen] = first
+            continue
+        left = count // 2
+        extent = np.ptp(points[chosen], axis=0)
+        chosen = chosen[np.argsort(points[chosen, int(np.argmax(extent))], kind="stable")]
+        heavy = np.cumsum(weights[chosen])
+        cut = int(np.searchsorted(heavy, heavy[-1] * left / count))
+        cut = min(max(cut, left), len(chosen) - (count - left))
+        todo += [(chosen[:cut], first, left), (chosen[cut:], first + left, count - left)]
+    return part
+
+
+class Halo:
+    """The nodes this rank shares with others, and the exchange of values there."""
+
+    def __init__(self, ranks: Ranks, nodes: Integers) -> None:
+        """nodes: the global numbers of this rank's nodes, sorted. Collective."""
+        self.ranks = ranks
+        self.neighbours: list[tuple[int, Integers]] = []
+        self.owned = np.ones(nodes.size, dtype=bool)
+        for rank, theirs in enumerate(ranks.everyones(nodes)):
+            if rank == ranks.rank:
+                continue
+            common = np.flatnonzero(np.isin(nodes, theirs, assume_unique=True))
+            if common.size:
+                self.neighbours.append((rank, common))
+                if rank < ranks.rank:
+                    self.owned[common] = False
+        shared = [common for _, common in self.neighbours]
+        self.shared = np.unique(np.concatenate(shared)) if shared else np.empty(0, dtype=np.int64)
+
+    def add(self, array: Array) -> None:
+        """Replace each shared node's partial sum by the sum over its holders, in place; (n,) or (n, F)."""
+        if not self.neighbours:
+            return
+        mine = array[self.shared]
+        received = self._exchange(array)
+        array[self.shared] = 0
+        waiting = True
+        for (rank, common), theirs in zip(self.neighbours, received, strict=True):
+            if waiting and rank > self.ranks.rank:
+                array[self.shared] += mine
+                waiting = False
+            array[common] += theirs
+        if waiting:
+            array[self.shared] += mine
+
+    def most(self, array: Array) -> None:
+        """Replace each shared node's value by the largest of its holders, in place."""
+        for (_, common), theirs in zip(self.neighbours, self._exchange(array), strict=True):
+            array[common] = np.maximum(array[common], theirs)
+
+    def _exchange(self, array: Array) -> list[Array]:
+        """Every neighbour's values at the nodes shared with it."""
+        comm = self.ranks.comm
+        sent = [array[common] for _, common in self.neighbours]
+        received = [np.empty_like(values) for values in sent]
+        requests = [comm.Irecv(values, rank) for (rank, _), values in zip(self.neighbours, received, strict=True)]
+        requests += [comm.Isend(values, rank) for (rank, _), values in zip(self.neighbours, sent, strict=True)]
+        MPI.Request.Waitall(requests)
+        return received
+
+
+@dataclass(frozen=True)
+class Share:
+    """One rank's part of the mesh: global numbers of its points and nodes (sorted) and the halo."""
+
+    ranks: Ranks
+    points: Integers
+    nodes: Integers
+    halo: Halo
+    total: int  # number of nodes of the whole mesh
+
+    @property
+    def owned(self) -> Integers:
+        """Local numbers of the nodes that this rank owns."""
+        return np.flatnonzero(self.halo.owned)
+
+
+class Collector:
+    """Brings nodal values of all ranks into the mesh's order: whole on rank 0, or in blocks for parallel writing."""
+
+    def __init__(self, share: Share, block: int) -> None:
+        """block: nodes per block; block j belongs to one rank, neighbouring blocks to the same or the next."""
+        self.share = share
+        self.block = block
+        ranks, total = share.ranks, share.total
+        blocks = -(-total // block)
+        limits = np.array([min(total, block * (blocks * r // ranks.size)) for r in range(ranks.size + 1)])
+        limits[-1] = total
+        self.first, self.last = int(limits[ranks.rank]), int(limits[ranks.rank + 1])
+        owned = share.nodes[share.owned]
+        target = np.searchsorted(limits, owned, side="right") - 1
+        self.sent = np.bincount(target, minlength=ranks.size)
+        self.received = np.array([counts[ranks.rank] for counts in ranks.everyones(self.sent)])
+        self.place = self._route(owned) - self.first
+        self.lengths = np.diff(limits)
+
+    def _route(self, values: Array) -> Array:
+        """Values of the owned nodes, sorted by number, to the ranks of their blocks; rows stay whole."""
+        ranks = self.share.ranks
+        if ranks.size == 1:
+            return values
+        row = int(np.prod(values.shape[1:], dtype=np.int64))
+        got = np.empty((int(self.received.sum()), *values.shape[1:]), dtype=values.dtype)
+        kind = MPI._typedict[values.dtype.char]
+        ranks.comm.Alltoallv(
+            [np.ascontiguousarray(values), self.sent * row, kind], [got, self.received * row, kind]
+        )
+        return got
+
+    def blocks(self, values: Array) -> Array:
+        """This rank's blocks [first, last) of the values; `values` are given at this rank's own nodes, in order."""
+        placed = np.empty((self.last - self.first, *values.shape[1:]), dtype=values.dtype)
+        placed[self.place] = self._route(values[self.share.owned])
+        return placed
+
+    def whole(self, values: Array) -> Array | None:
+        """All values in the mesh's order on rank 0, None elsewhere."""
+        part = self.blocks(values)
+        ranks = self.share.ranks
+        if ranks.size == 1:
+            return part
+        row = int(np.prod(values.shape[1:], dtype=np.int64))
+        kind = MPI._typedict[values.dtype.char]
+        everything = np.empty((self.share.total, *values.shape[1:]), dtype=values.dtype) if ranks.root else None
+        target = [everything, self.lengths * row, kind] if ranks.root else None
+        ranks.comm.Gatherv([part, part.size, kind], target)
+        return everything

@@ -1,0 +1,54 @@
+"""From a case to a scheme and a state: mesh, initial fields, division among the ranks."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .case import Case
+from .discretisation import activity, discretise, ring
+from .geometry import Mesh, make_mesh
+from .integrators import RK2, Chebyshev, Integrator, paper_step
+from .partition import Ranks
+from .scheme import Scheme
+from .state import State, initial_state
+
+
+def build_mesh(case: Case, ranks: Ranks) -> Mesh:
+    """The case's mesh on every rank. A lattice is built by each; a generated or read mesh comes from rank 0."""
+    if case.nodes.source == "lattice":
+        return make_mesh(case.nodes, case.domain.size)
+    return ranks.from_root(make_mesh(case.nodes, case.domain.size) if ranks.root else None)
+
+
+def prepare(case: Case, mesh: Mesh, ranks: Ranks, whole: State | None = None) -> tuple[Scheme, State]:
+    """The scheme and the state on this rank; `whole` is the state to go on from, on all nodes (None: the initial one).
+
+    Collective. The division follows the work expected for that state.
+    """
+    if whole is None:
+        whole = initial_state(case, mesh.nodes, ring(case, mesh))
+    eps = min(case.activation.eps_rho, case.activation.eps_eta)
+    d = discretise(case, mesh, ranks, activity(mesh, whole.u, eps))
+    nodes = d.share.nodes
+    state = replace(whole, u=whole.u[nodes].copy(), owner=whole.owner[nodes].copy(), slot_of=whole.slot_of.copy())
+    return Scheme(d, state), state
+
+
+def make_integrator(case: Case, mesh: Mesh, memory: dict[str, float] | None = None) -> Integrator:
+    """The integrator that the case asks for; memory: what a checkpoint kept of it."""
+    if case.time.integrator == "adaptive":
+        return Chebyshev(case.time.tolerance, memory)
+    return RK2(case.time.step or paper_step(shortest_distance(case, mesh), case))
+
+
+def shortest_distance(case: Case, mesh: Mesh) -> float:
+    """d_min of the paper's step rule, nm: the spacing of a lattice, else the smallest distance between two nodes.
+
+    A lattice has nodes at half the spacing along two walls; they do not limit the step, whose rule is five times
+    below the stability limit of a lattice without them.
+    """
+    if case.nodes.source == "lattice":
+        return float(mesh.spacing.min())
+    distance, _ = cKDTree(mesh.nodes).query(mesh.nodes, k=2)
+    return float(np.min(distance[:, 1]))

@@ -1,0 +1,142 @@
+"""The run: from one output time to the next, with the checks between steps."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels
+from .case import Case
+from .integrators import Integrator
+from .scheme import Scheme
+from .state import State
+
+Floats = NDArray[np.float64]
+
+LOWEST, HIGHEST = -0.5, 1.5  # fields outside these are not physics any more
+SAME_TIME = 1e-9  # of the end: output times nearer than this are one
+LAG = 20.0  # eps that a watched value may move before the set of live points is made anew
+REFRESH = 50  # steps after which points that have come to rest are switched off
+
+
+class RunError(RuntimeError):
+    """The fields have become meaningless; the message names time, step, place and the likely cause."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """An output time: a history row, and perhaps the snapshot of this number."""
+
+    time: float
+    history: bool
+    snapshot: int | None
+
+
+class Observer(Protocol):
+    """What listens to a run. All ranks call every method at the same moment."""
+
+    def history(self, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+        """A history time has been reached; u are the fields there."""
+
+    def snapshot(self, number: int, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+        """A snapshot time has been reached."""
+
+    def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
+        """A step has ended well: time for checkpoints and progress. True ends the run here."""
+
+
+def events(case: Case) -> list[Event]:
+    """All output times of a case, in order; the first is 0, the last the end."""
+    end, every = case.time.end, case.output.history_every
+    rows = [k * every for k in range(int(end / every * (1.0 + SAME_TIME)) + 1)]
+    snapshots = list(case.output.snapshot_times(end))
+    marks = [(t, True, None) for t in [*rows, end]] + [(t, False, k) for k, t in enumerate(snapshots)]
+    merged: list[Event] = []
+    for time, history, snapshot in sorted(marks, key=lambda mark: mark[0]):
+        if merged and time - merged[-1].time <= SAME_TIME * end:
+            last = merged[-1]
+            number = last.snapshot if snapshot is None else snapshot
+            merged[-1] = Event(last.time, last.history or history, number)
+        else:
+            merged.append(Event(time, history, snapshot))
+    return merged
+
+
+def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer) -> bool:
+    """March from the state's time to the end of the case. False where the observer ended it before.
+
+    A fresh state first gives the events of time 0; a resumed one goes on behind its time.
+    """
+    case = scheme.d.case
+    waiting = [event for event in events(case) if event.time > state.time or state.step == 0]
+    integrator.restart(scheme, state)
+    while waiting:
+        limit = waiting[0].time if integrator.stops_at_events else waiting[-1].time
+        if state.time < waiting[0].time:
+            integrator.step(scheme, state, limit)
+            check(scheme, state)
+        for event in reached(waiting, state.time):
+            u = integrator.at(scheme, state, event.time) if state.step else state.u
+            if event.history:
+                observer.history(scheme, state, u, event.time)
+            if event.snapshot is not None:
+                observer.snapshot(event.snapshot, scheme, state, u, event.time)
+        if renew(scheme, state):
+            integrator.restart(scheme, state)
+        if observer.after_step(scheme, state, integrator) and waiting:
+            return False
+    return True
+
+
+def reached(waiting: list[Event], time: float) -> Iterator[Event]:
+    """Take the events up to a time off the list."""
+    while waiting and waiting[0].time <= time:
+        yield waiting.pop(0)
+
+
+def renew(scheme: Scheme, state: State) -> bool:
+    """Make the set of live points anew when a value that it rests on has moved, and every `REFRESH` steps.
+
+    True where that happened: rates computed before no longer hold. Collective.
+    """
+    switch = scheme.d.case.activation
+    if state.step == 0 or not (switch.enabled or switch.few_order_parameters):
+        return False
+    moved = np.array([scheme.active.stale(state.u, switch.eps_rho, switch.eps_eta)])
+    scheme.d.share.ranks.max(moved)
+    if moved[0] < LAG and state.step % REFRESH:
+        return False
+    scheme.activate(state)
+    return True
+
+
+def check(scheme: Scheme, state: State) -> None:
+    """Raise RunError on every rank where a field is not a number or outside [-0.5, 1.5]. Collective."""
+    d = scheme.d
+    bad = kernels.first_outside(state.u, scheme.active.nodes, LOWEST, HIGHEST)
+    worst = np.array([-1.0 if bad < 0 else float(d.share.nodes[bad])])
+    d.share.ranks.max(worst)
+    if worst[0] < 0.0:
+        return
+    here = np.flatnonzero(d.share.nodes == int(worst[0]))
+    mine = describe(scheme, state, int(here[0])) if here.size else None
+    reports = [report for report in d.share.ranks.everyones(np.array([mine], dtype=object)) if report[0] is not None]
+    raise RunError(reports[0][0])
+
+
+def describe(scheme: Scheme, state: State, node: int) -> str:
+    """Time, step, place and likely cause of a bad value at a node of this rank."""
+    place = ", ".join(f"{x:.3f}" for x in scheme.d.positions[node])
+    fields = [f"rho = {state.u[node, 0]:.4g}"]
+    fields += [
+        f"eta of particle {a} = {state.u[node, 1 + s]:.4g}" for s, a in enumerate(state.owner[node]) if a >= 0
+    ]
+    cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
+    if scheme.d.case.model.rigid_motion:
+        cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
+    return (
+        f"at t = {state.time:.6g}, step {state.step}, node {scheme.d.share.nodes[node]} at ({place}) nm: "
+        f"{', '.join(fields)} left [{LOWEST:g}, {HIGHEST:g}]; likely cause: {cause}"
+    )

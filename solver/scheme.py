@@ -1,0 +1,73 @@
+"""The algorithm: the rates of change of all nodal fields, equation by equation.
+
+Nodes carry rho and eta, material points only integrate (Huang et al. 2023, section 2.2). No loop over points is here:
+`kernels` has them, `active` says which points are live, `rigid` turns contact forces into velocities.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels, rigid
+from .active import Active, activate
+from .discretisation import Discretisation
+from .state import State
+
+Floats = NDArray[np.float64]
+
+
+class Scheme:
+    """du/dt = rates(u) on one rank's nodes, for the live points of the moment."""
+
+    def __init__(self, d: Discretisation, state: State) -> None:
+        self.d = d
+        self.particles = len(state.slot_of)
+        self.activate(state)
+
+    def activate(self, state: State) -> None:
+        """Choose the live points and the slots for this state (it may move slots), and fit the work arrays. Collective."""
+        self.active: Active = activate(self.d, state)
+        points = self.active.live.size
+        self.slot_of, self.node_owner = state.slot_of, state.owner
+        self.W = np.zeros(self.d.nodes)
+        self.D = np.empty(points)
+        self.point = np.zeros((points * (1 + self.d.dim), state.u.shape[1]))
+        bodies = self.d.dim + rigid.rotations(self.d.dim), 1 + self.d.dim
+        self.sums = np.zeros((self.particles, sum(bodies)))
+        self.forces, self.moments = self.sums[:, : bodies[0]], self.sums[:, bodies[0] :]
+        self.motion = np.zeros((self.particles, bodies[0]))
+
+    def rates(self, u: Floats, rate: Floats) -> None:
+        """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective."""
+        d, a, m, table = self.d, self.active, self.d.coefficients, self.d.shape
+        moving = d.case.model.rigid_motion
+
+        # Fields and gradients at the points (17), mobility (5), contact forces (25)-(27), and the potential (24)
+        #   W_a = 1/m_a sum_p w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]
+        kernels.start(self.W, a.potential, a.nodes)
+        self.sums[:] = 0.0
+        kernels.potential(
+            self.W, self.forces, self.point, self.D, u, a.live, a.owner, d.weights, d.x,
+            table.offsets, table.nodes, table.table, m, moving,
+        )
+        d.share.halo.add(self.W)
+        self.W[a.nodes] /= d.mass[a.nodes]
+
+        # Rigid motion of each particle (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
+        if moving:
+            self.moments += a.moments
+            kernels.add_moments(self.moments, u, a.owned, self.node_owner, d.mass, d.first_moment)
+            d.share.ranks.sum(self.sums)
+            self.motion = rigid.velocities(self.forces, self.moments, m)
+
+        # Fluxes (20), (21)
+        #   rate rho_a = 1/m_a sum_p w_p [ -D grad N_a . grad W_p + rho_p grad N_a . v_adv ]
+        #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
+        kernels.clear(rate, a.nodes)
+        kernels.divergence(
+            rate, self.point, self.D, self.W, self.motion, a.live, a.owner, d.weights, d.x,
+            table.offsets, table.nodes, table.table, m, moving, d.huang,
+        )
+        if moving:
+            kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
+        d.share.halo.add(rate)
+        kernels.divide(rate, d.mass, a.nodes)

@@ -1,0 +1,276 @@
+"""Shape functions: who sees whom, and with what weight.
+
+`lme` builds local maximum-entropy functions (Arroyo & Ortiz 2006) on scattered nodes, `linear` the finite-element
+functions of the same mesh. Both give a `ShapeTable`, the only thing that the kernels know of the discretisation.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .jit import jit
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Numbers = NDArray[np.int32]
+
+CHUNK = 65_536  # points whose neighbours are held as Python lists at one time
+CONVERGED = 1e-13  # |sum N (x - x_a)| / h; the consistency of the table is this times h
+NEWTON_STEPS = 60
+WIDER = 1.25  # factor on h at a point whose Newton iteration fails
+ATTEMPTS = 8
+
+
+class ShapeError(ValueError):
+    """Shape functions that cannot be had; the message names the point, gamma and the number of nodes in range."""
+
+
+@dataclass(frozen=True)
+class ShapeTable:
+    """Compressed rows: point p sees nodes[offsets[p] : offsets[p + 1]].
+
+    offsets (p + 1,), nodes (e,), table (e, 1 + dim) = (N, grad N); N without unit, grad N in 1/nm.
+    """
+
+    offsets: Integers
+    nodes: Numbers
+    table: Floats
+
+    @property
+    def points(self) -> int:
+        """The number of points."""
+        return self.offsets.size - 1
+
+
+def row_offsets(counts: Integers) -> Integers:
+    """The starts of rows of the given lengths, and the end of the last."""
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
+
+
+def search_range(spacing: Floats, gamma: float, tolerance: float) -> Floats:
+    """r = h sqrt(-ln(delta_0) / gamma): where exp(-beta r^2) with beta = gamma / h^2 falls to delta_0; nm."""
+    return spacing * np.sqrt(-np.log(tolerance) / gamma)
+
+
+def linear(points: Floats, cells: Numbers, nodes: Floats) -> ShapeTable:
+    """Barycentric coordinates of each point in the cell of the same number, and their constant gradients.
+
+    points (p, dim), cells (p, dim + 1), nodes (n, dim).
+    """
+    count, corners = cells.shape
+    edges = nodes[cells[:, 1:]] - nodes[cells[:, :1]]
+    gradients = np.linalg.inv(edges).transpose(0, 2, 1)
+    table = np.empty((count, corners, corners))
+    table[:, 1:, 1:] = gradients
+    table[:, 0, 1:] = -gradients.sum(axis=1)
+    table[:, 1:, 0] = np.einsum("pkd,pd->pk", gradients, points - nodes[cells[:, 0]])
+    table[:, 0, 0] = 1.0 - table[:, 1:, 0].sum(axis=1)
+    offsets = np.arange(count + 1, dtype=np.int64) * corners
+    return ShapeTable(offsets, cells.reshape(-1).astype(np.int32), table.reshape(-1, corners))
+
+
+def lme(
+    points: Floats, spacing: Floats, nodes: Floats, gamma: float, tolerance: float, tree: "cKDTree | None" = None
+) -> ShapeTable:
+    """Local maximum-entropy functions of the nodes at the points.
+
+    N_a(x) = exp(-beta |x - x_a|^2 + lambda . (x - x_a)) / Z with beta = gamma / h^2 and lambda such that
+    sum_a N_a (x - x_a) = 0;  grad N_a = -N_a J^-1 (x - x_a),  J = sum_a N_a (x - x_a)(x - x_a)^T.
+    N_a is dropped beyond `search_range`. points (p, dim) nm, spacing (p,) h at the points in nm, nodes (n, dim) nm;
+    tree: a k-d tree of the nodes, built when absent.
+
+    A point whose Newton iteration does not converge is tried again with h, and so the range, 1.25 times wider, up to
+    8 times; ShapeError says which point defeats that. Source: Arroyo & Ortiz (2006), equations (24)-(33).
+    """
+    tree = cKDTree(nodes) if tree is None else tree
+    parts = list(_lme_chunks(points, spacing, nodes, tree, gamma, tolerance))
+    offsets = row_offsets(np.concatenate([part[0] for part in parts]))
+    return ShapeTable(offsets, np.concatenate([part[1] for part in parts]), np.concatenate([part[2] for part in parts]))
+
+
+def _lme_chunks(
+    points: Floats, spacing: Floats, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
+) -> Iterator[tuple[Integers, Numbers, Floats]]:
+    for first in range(0, max(len(points), 1), CHUNK):
+        part = slice(first, first + CHUNK)
+        counts, near, table, residual = _solve(points[part], spacing[part], nodes, tree, gamma, tolerance)
+        failed = np.flatnonzero(~(residual <= CONVERGED))
+        if failed.size:
+            rows = np.split(np.arange(near.size), np.cumsum(counts)[:-1])
+            nears, tables = [near[row] for row in rows], [table[row] for row in rows]
+            for p in failed:
+                nears[p], tables[p] = _repair(
+                    first + p, points[first + p], spacing[first + p], nodes, tree, gamma, tolerance
+                )
+            counts = np.array([row.size for row in nears], dtype=np.int64)
+            near, table = np.concatenate(nears), np.concatenate(tables)
+        yield counts, near, table
+
+
+def _solve(
+    points: Floats, spacing: Floats, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
+) -> tuple[Integers, Numbers, Floats, Floats]:
+    """Neighbour counts, neighbours, table and Newton residuals |r| / h of some points."""
+    lists = tree.query_ball_point(points, search_range(spacing, gamma, tolerance))
+    counts = np.fromiter(map(len, lists), np.int64, len(lists))
+    near = np.fromiter(chain.from_iterable(lists), np.int32, int(counts.sum()))
+    offsets = row_offsets(counts)
+    table = np.empty((near.size, 1 + nodes.shape[1]))
+    residual = np.empty(counts.size)
+    solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma)
+    return counts, near, table, residual
+
+
+def _repair(
+    p: int, point: Floats, spacing: float, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
+) -> tuple[Numbers, Floats]:
+    """The table row of a point that needs a wider range, or ShapeError."""
+    h = spacing
+    for _ in range(ATTEMPTS):
+        h *= WIDER
+        _, near, table, residual = _solve(point[None], np.array([h]), nodes, tree, gamma, tolerance)
+        if residual[0] <= CONVERGED:
+            return near, table
+    r = float(search_range(np.array([h]), gamma, tolerance)[0])
+    raise ShapeError(
+        f"Newton stopped at |r| = {residual[0]:.1e} h at point {p} ({', '.join(f'{x:.6g}' for x in point)}) nm with "
+        f"gamma = {gamma:g}: {near.size} nodes within {r:.3g} nm do not surround it"
+    )
+
+
+@jit
+def solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma):
+    """Fill table (e, 1 + dim) and residual (p,) = |sum N (x - x_a)| / h; infinity where Newton did not converge.
+
+    Newton on the convex log Z(lambda), with step halving where log Z would grow, in units of h.
+    """
+    dim = points.shape[1]
+    most = 0
+    for p in range(points.shape[0]):
+        most = max(most, offsets[p + 1] - offsets[p])
+    d = np.empty((most, dim))
+    weight = np.empty(most)
+    multiplier = np.empty(dim)
+    step = np.empty(dim)
+    r = np.empty(dim)
+    J = np.empty((dim, dim))
+    inverse = np.empty((dim, dim))
+    for p in range(points.shape[0]):
+        first = offsets[p]
+        count = offsets[p + 1] - first
+        h = spacing[p]
+        residual[p] = np.inf
+        if count <= dim:
+            continue
+        for i in range(count):
+            for k in range(dim):
+                d[i, k] = (points[p, k] - nodes[near[first + i], k]) / h
+        multiplier[:] = 0.0
+        log_Z = sum_up(weight, r, J, d, count, multiplier, gamma)
+        size = norm(r)
+        for _ in range(NEWTON_STEPS):
+            if size <= 1e-15 or not invert(inverse, J):
+                break
+            step[:] = 0.0
+            for k in range(dim):
+                for q in range(dim):
+                    step[k] -= inverse[k, q] * r[q]
+            descent = 0.0
+            for k in range(dim):
+                descent += step[k] * r[k]
+            length = 1.0
+            while True:
+                for k in range(dim):
+                    multiplier[k] += length * step[k]
+                trial = sum_up(weight, r, J, d, count, multiplier, gamma)
+                if size < 1e-4 or trial <= log_Z + 1e-4 * length * descent or length < 1e-6:
+                    break
+                for k in range(dim):
+                    multiplier[k] -= length * step[k]
+                length *= 0.5
+            log_Z = trial
+            previous = size
+            size = norm(r)
+            if size <= CONVERGED and size >= 0.5 * previous:
+                break
+        if not size <= CONVERGED or not invert(inverse, J):
+            continue
+        residual[p] = size
+        for i in range(count):
+            table[first + i, 0] = weight[i]
+            for k in range(dim):
+                g = 0.0
+                for q in range(dim):
+                    g += inverse[k, q] * d[i, q]
+                table[first + i, 1 + k] = -weight[i] * g / h
+
+
+@jit
+def sum_up(weight, r, J, d, count, multiplier, gamma):
+    """weight = N_a, r = sum N d, J = sum N d d^T - r r^T (the Hessian of log Z) and, returned, log Z; d in units of h."""
+    dim = d.shape[1]
+    largest = -np.inf
+    for i in range(count):
+        exponent = 0.0
+        for k in range(dim):
+            exponent += d[i, k] * (multiplier[k] - gamma * d[i, k])
+        weight[i] = exponent
+        largest = max(largest, exponent)
+    Z = 0.0
+    for i in range(count):
+        weight[i] = np.exp(weight[i] - largest)
+        Z += weight[i]
+    r[:] = 0.0
+    J[:] = 0.0
+    for i in range(count):
+        weight[i] /= Z
+        for k in range(dim):
+            r[k] += weight[i] * d[i, k]
+            for q in range(k + 1):
+                J[k, q] += weight[i] * d[i, k] * d[i, q]
+    for k in range(dim):
+        for q in range(k + 1):
+            J[k, q] -= r[k] * r[q]
+            J[q, k] = J[k, q]
+    return np.log(Z) + largest
+
+
+@jit
+def norm(r):
+    """|r|."""
+    square = 0.0
+    for k in range(r.size):
+        square += r[k] * r[k]
+    return np.sqrt(square)
+
+
+@jit
+def invert(inverse, J):
+    """The inverse of a symmetric positive 2 x 2 or 3 x 3 matrix; False where its determinant is not positive."""
+    if J.shape[0] == 2:
+        det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+        if not det > 1e-300:
+            return False
+        inverse[0, 0] = J[1, 1] / det
+        inverse[1, 1] = J[0, 0] / det
+        inverse[0, 1] = -J[0, 1] / det
+        inverse[1, 0] = inverse[0, 1]
+        return True
+    for i in range(3):
+        for j in range(3):
+            a = (j + 1) % 3
+            b = (j + 2) % 3
+            c = (i + 1) % 3
+            e = (i + 2) % 3
+            inverse[i, j] = J[a, c] * J[b, e] - J[a, e] * J[b, c]
+    det = J[0, 0] * inverse[0, 0] + J[0, 1] * inverse[1, 0] + J[0, 2] * inverse[2, 0]
+    if not det > 1e-300:
+        return False
+    for i in range(3):
+        for j in range(3):
+            inverse[i, j] /= det
+    return True

@@ -1,0 +1,104 @@
+"""Few order parameters: particles that never meet share a slot (section 2.5 of the paper).
+
+Every particle has one slot, the same everywhere; two particles may share a slot as long as no material point sees
+both. That is a colouring of the graph of particles that meet. When two particles of one slot come close, one of them
+gets another slot, and when no slot is free another one is made: nothing is ever dropped.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .jit import jit
+
+Numbers = NDArray[np.int32]
+Pairs = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+MOST_SLOTS = 62  # bits of a watch word; see `kernels.watch_nodes`
+
+
+class SlotError(RuntimeError):
+    """More particles meet at one place than frit has slots."""
+
+
+def unique_pairs(pairs: Pairs) -> Pairs:
+    """The distinct rows (a, b) with a < b, sorted; (pairs, 2)."""
+    ordered = np.sort(pairs.reshape(-1, 2), axis=1)
+    return np.unique(ordered[(ordered[:, 0] >= 0) & (ordered[:, 0] < ordered[:, 1])], axis=0)
+
+
+def colour(pairs: Pairs, particles: int) -> Numbers:
+    """A slot for every particle so that the particles of a pair differ; largest degree first, lowest slot free."""
+    meets = _adjacency(pairs, particles)
+    slot_of = np.full(particles, -1, dtype=np.int32)
+    for a in sorted(range(particles), key=lambda a: (-len(meets[a]), a)):
+        slot_of[a] = _lowest_free(slot_of, meets[a])
+    return slot_of
+
+
+def recolour(slot_of: Numbers, pairs: Pairs) -> Numbers:
+    """New slots in which no pair shares one; only particles that clash move, the one with fewer neighbours first."""
+    meets = _adjacency(pairs, len(slot_of))
+    new = slot_of.copy()
+    for a, b in pairs[slot_of[pairs[:, 0]] == slot_of[pairs[:, 1]]]:
+        if new[a] == new[b]:
+            moved = min((a, b), key=lambda c: (len(meets[c]), c))
+            new[moved] = _lowest_free(new, meets[moved])
+    return new
+
+
+def _adjacency(pairs: Pairs, particles: int) -> list[list[int]]:
+    meets: list[list[int]] = [[] for _ in range(particles)]
+    for a, b in pairs.tolist():
+        meets[a].append(b)
+        meets[b].append(a)
+    return meets
+
+
+def _lowest_free(slot_of: Numbers, neighbours: list[int]) -> int:
+    taken = {int(slot_of[b]) for b in neighbours}
+    free = next(s for s in range(len(taken) + 1) if s not in taken)
+    if free >= MOST_SLOTS:
+        raise SlotError(f"{free + 1} particles meet at one place, at most {MOST_SLOTS} can")
+    return free
+
+
+def repack(u: Floats, owner: Numbers, slot_of: Numbers, columns: int) -> tuple[Floats, Numbers]:
+    """Fields and owners with every particle's values moved to its slot; `columns` is the new F."""
+    new_u = np.zeros((len(u), columns))
+    new_owner = np.full((len(u), columns - 1), -1, dtype=np.int32)
+    move(new_u, new_owner, u, owner, slot_of)
+    return new_u, new_owner
+
+
+@jit
+def move(new_u, new_owner, u, owner, slot_of):
+    """Copy rho, and every owned eta into the slot of its owner."""
+    for a in range(u.shape[0]):
+        new_u[a, 0] = u[a, 0]
+        for s in range(owner.shape[1]):
+            if owner[a, s] >= 0:
+                new_u[a, 1 + slot_of[owner[a, s]]] = u[a, 1 + s]
+                new_owner[a, slot_of[owner[a, s]]] = owner[a, s]
+
+
+@jit
+def meeting(owner, chosen):
+    """Every pair of particles that the chosen points see together, as (pairs, 2); pairs repeat."""
+    count = 0
+    for p in chosen:
+        found = 0
+        for s in range(owner.shape[1]):
+            if owner[p, s] >= 0:
+                count += found
+                found += 1
+    pairs = np.empty((count, 2), dtype=np.int64)
+    count = 0
+    for p in chosen:
+        for s in range(owner.shape[1]):
+            for t in range(s):
+                if owner[p, s] >= 0 and owner[p, t] >= 0:
+                    pairs[count, 0] = owner[p, s]
+                    pairs[count, 1] = owner[p, t]
+                    count += 1
+    return pairs

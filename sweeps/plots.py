@@ -1,0 +1,287 @@
+"""Pictures of one run directory: a snapshot as sections through the pack, the history as curves.
+
+matplotlib and zarr are imported where a figure is made, for read_history() must stay quick; pyplot is not, so
+that a notebook's or a server's own backend is left alone.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import zarr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Paul Tol's light scheme: told apart with any colour vision, and dark lines show on all of it.
+PALETTE = ("#77aadd", "#ee8866", "#eedd88", "#44bb99", "#ffaabb", "#bbcc33", "#99ddff", "#aaaa00")
+NO_OWNER = "#dddddd"
+BOUNDARY = np.array([0.12, 0.12, 0.16])  # colour of a grain boundary
+NEIGHBOURS = {2: 9, 3: 16}  # nodes that a pixel is interpolated from
+PIXELS = {2: 700, 3: 400}  # along the longest edge of the domain
+PANELS = (
+    ("vacancy_ratio", "vacancy ratio", "vacancy ratio"),
+    ("free_energy", "free energy", "free energy"),
+    ("live_fraction", "live fraction", "live fraction"),
+    ("neck_length", "neck (nm)", "neck (nm²)"),
+)
+
+
+class PlotError(ValueError):
+    """There is nothing to draw: no snapshot, no history."""
+
+
+# --- history --------------------------------------------------------------------------------------------
+
+
+def read_history(directory: Path) -> dict[str, NDArray[Any]]:
+    """The scalar columns of history.jsonl, NaN where a row has none; a torn last line is left out."""
+    path = directory / "history.jsonl"
+    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []  # a whole line ends with a newline
+    rows = [_row(line, f"{path}, line {number}") for number, line in enumerate(lines, 1)]
+    keys = dict.fromkeys(key for row in rows for key, value in row.items() if isinstance(value, int | float))
+    return {key: np.array([np.nan if row.get(key) is None else row[key] for row in rows]) for key in keys}
+
+
+def _row(line: bytes, where: str) -> dict[str, Any]:
+    try:
+        return dict(json.loads(line))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def plot_history(directory: Path, out: Path) -> None:
+    """Vacancy ratio against time and, below it, what else the history has of PANELS."""
+    history = read_history(directory)
+    if not history:
+        raise PlotError(f"{directory} has no history to draw")
+    case = _read_case(directory)
+    flat = len(case["domain"]["size"]) == 2
+    panels = [(key, plane if flat else solid) for key, plane, solid in PANELS if key in history]
+    heights = [2.0 if key == "vacancy_ratio" else 1.0 for key, _ in panels]
+    figure = _figure(5.2, 1.15 * sum(heights) + 0.7)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, (key, label) in zip(axes, panels, strict=True):
+        marker = "." if len(history[key]) < 2 else None
+        ax.plot(history["time"], history[key], color="#20639b", lw=1.4, marker=marker)
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.25, lw=0.5)
+        ax.margins(x=0.01)
+    axes[0].set_title(case["name"])
+    axes[-1].set_xlabel("time (model units)")
+    figure.align_ylabels(list(axes))
+    _save(figure, out)
+
+
+# --- snapshots ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Fields at the nodes; `first_owner` is the owner in the first snapshot, which fixes the colours."""
+
+    time: float
+    nodes: Floats
+    rho: Floats
+    eta_squared: Floats
+    owner: Ints
+    first_owner: Ints
+
+
+def nearest_time(directory: Path, time: float) -> float:
+    """The time of the snapshot that is nearest to `time`."""
+    times = np.asarray(_array(_open(directory), "time")[:], float)
+    return float(times[_nearest(times, time, directory)])
+
+
+def read_snapshot(directory: Path, time: float) -> Snapshot:
+    """The snapshot nearest to `time`; the store is opened read-only."""
+    group = _open(directory)
+    times = np.asarray(_array(group, "time")[:], float)
+    row = _nearest(times, time, directory)
+    return Snapshot(
+        time=float(times[row]),
+        nodes=np.asarray(_array(group, "nodes")[:], float),
+        rho=np.asarray(_array(group, "rho")[row], float),
+        eta_squared=np.asarray(_array(group, "eta_squared")[row], float),
+        owner=np.asarray(_array(group, "particle")[row], int),
+        first_owner=np.asarray(_array(group, "particle")[0], int),
+    )
+
+
+def plot_snapshot(directory: Path, time: float, out: Path) -> float:
+    """Draw the snapshot nearest to `time`, in 3-D its three mid-planes. Returns its time."""
+    case, snapshot = _read_case(directory), read_snapshot(directory, time)
+    size = np.asarray(case["domain"]["size"], float)
+    colours = particle_colours(snapshot.nodes, snapshot.first_owner, int(snapshot.owner.max(initial=0)))
+    planes = [(0, 1)] if len(size) == 2 else [(0, 1), (0, 2), (1, 2)]
+    width, height = sum(size[i] for i, _ in planes), max(size[j] for _, j in planes)
+    inches = 6.0 if len(size) == 2 else 9.0
+    figure = _figure(inches, (inches - 0.7 * len(planes)) * height / width + 0.8)
+    axes = figure.subplots(1, len(planes), squeeze=False, width_ratios=[size[i] for i, _ in planes])[0]
+    for ax, plane in zip(axes, planes, strict=True):
+        _draw_section(ax, snapshot, colours, size, plane)
+        if box := (case.get("output") or {}).get("vacancy_box"):
+            _draw_box(ax, np.asarray(box, float), plane)
+    title = f"{case['name']}, t = {snapshot.time:g}"
+    if len(planes) == 1:
+        axes[0].set_title(title)
+    else:
+        figure.suptitle(title, fontsize=9.5)
+    _save(figure, out)
+    return snapshot.time
+
+
+def particle_colours(nodes: Floats, owner: Ints, last: int = 0) -> Floats:
+    """Red, green, blue per particle (rows to `last` at least), grey for owner -1.
+
+    Largest first, each takes the colour whose nearest holder is farthest away: those that can touch differ.
+    """
+    from matplotlib.colors import to_rgb
+
+    mine, rows = owner >= 0, max(int(owner.max(initial=0)), last) + 1
+    count = np.bincount(owner[mine], minlength=rows)
+    sums = [np.bincount(owner[mine], x[mine], minlength=rows) for x in nodes.T]
+    centre = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
+    dim, cell = nodes.shape[1], np.prod(np.ptp(nodes, axis=0)) / len(nodes)
+    radius = (count * cell / {2: np.pi, 3: 4 / 3 * np.pi}[dim]) ** (1 / dim)
+    gap_to_colour = np.full((rows, len(PALETTE)), np.inf)
+    chosen = np.zeros(rows, int)
+    for a in np.argsort(-count, kind="stable"):
+        chosen[a] = c = gap_to_colour[a].argmax()
+        gap = np.linalg.norm(centre - centre[a], axis=1) - radius - radius[a]
+        gap_to_colour[:, c] = np.minimum(gap_to_colour[:, c], gap)
+    palette: Floats = np.array([to_rgb(colour) for colour in (*PALETTE, NO_OWNER)])
+    return palette[[*chosen, len(PALETTE)]]
+
+
+def interpolate(nodes: Floats, fields: Floats, at: Floats) -> Floats:
+    """Fields (n, f) of scattered nodes at points (p, dim), by moving least squares: exact where they are linear.
+
+    weight_a = w_a P_a . M^-1 (1, 0..), M = sum w P P^T, P = (1, x_a - x), w = (1 - d^2 / reach^2)^2
+    """
+    from scipy.spatial import cKDTree
+
+    tree, count = cKDTree(nodes), min(NEIGHBOURS[nodes.shape[1]], len(nodes) - 1)
+    values = np.empty((len(at), fields.shape[1]))
+    for part in np.array_split(np.arange(len(at)), len(at) // 50_000 + 1):
+        found = tree.query(at[part], count + 1)
+        distance, near = np.asarray(found[0])[..., None], np.asarray(found[1])[:, :-1]
+        reach = distance[:, -1:]
+        P = np.concatenate([np.ones((*near.shape, 1)), (nodes[near] - at[part, None]) / reach], axis=-1)
+        w = (1 - (distance[:, :-1] / reach) ** 2) ** 2
+        M = (w * P).swapaxes(1, 2) @ P + 1e-9 * np.eye(P.shape[-1])
+        first = np.linalg.solve(M, np.eye(P.shape[-1])[:, :1])
+        values[part] = np.einsum("pa,paf->pf", (w * (P @ first))[..., 0], fields[near])
+    return values
+
+
+def section(
+    snapshot: Snapshot, colours: Floats, size: Floats, plane: tuple[int, int]
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """x, y, rho (ny, nx) and picture (ny, nx, 3) of a plane, in 3-D of one through the middle."""
+    i, j = plane
+    pitch = size.max() / PIXELS[len(size)]
+    x, y = (np.linspace(0, size[k], round(size[k] / pitch)) for k in plane)
+    at = np.tile(size / 2, (len(x) * len(y), 1))
+    at[:, i], at[:, j] = (grid.ravel() for grid in np.meshgrid(x, y))
+    nodes, near = snapshot.nodes, np.full(len(snapshot.nodes), True)
+    for k in set(range(len(size))) - {i, j}:
+        near &= abs(nodes[:, k] - size[k] / 2) < 4 * (np.prod(size) / len(nodes)) ** (1 / len(size))
+    rho, eta_squared, owner = snapshot.rho[near], snapshot.eta_squared[near], snapshot.owner[near]
+    tint = np.where(owner >= 0, np.maximum(rho, 1e-6), 1e-9)[:, None]
+    fields = np.column_stack([rho, eta_squared, tint, tint * colours[owner]])
+    values = interpolate(nodes[near], fields, at).reshape(len(y), len(x), -1)
+    return x, y, values[..., 0], _shade(values)
+
+
+def _shade(values: Floats) -> Floats:
+    """Particles in colour, grain boundaries dark, vacancy white; `values`: rho, sum eta^2, tint, tint x colour.
+
+    eta^2 / rho^2 is 1 in a grain, on to its surface, and 1/2 where two grains meet.
+    """
+    rho, eta_squared, tint = (values[..., k : k + 1] for k in range(3))
+    solid = (2 * rho - 0.5).clip(0, 1)
+    dark = (2 - 2 * eta_squared / np.maximum(rho, 0.3) ** 2).clip(0, 1) ** 2
+    colour = (values[..., 3:] / np.maximum(tint, 1e-9)).clip(0, 1)
+    picture: Floats = 1 + solid * (colour + dark * (BOUNDARY - colour) - 1)
+    return picture
+
+
+def _draw_section(
+    ax: "Axes", snapshot: Snapshot, colours: Floats, size: Floats, plane: tuple[int, int]
+) -> None:
+    x, y, rho, picture = section(snapshot, colours, size, plane)
+    (i, j), names = plane, "xyz"
+    ax.imshow(picture, origin="lower", extent=(0, size[i], 0, size[j]), interpolation="bilinear")
+    if rho.min() < 0.5 < rho.max():
+        ax.contour(x, y, rho, [0.5], colors="black", linewidths=0.6)
+    ax.set(xlabel=f"{names[i]} (nm)", ylabel=f"{names[j]} (nm)", aspect="equal", anchor="S")
+    for k in set(range(len(size))) - {i, j}:
+        ax.set_title(f"{names[k]} = {size[k] / 2:g} nm")
+
+
+def _draw_box(ax: "Axes", box: Floats, plane: tuple[int, int]) -> None:
+    from matplotlib.patches import Rectangle
+
+    (low, high), axes = box, list(plane)
+    ax.add_patch(
+        Rectangle(tuple(low[axes]), *(high - low)[axes], fill=False, ec="#444444", lw=0.8, ls=(0, (4, 3)))
+    )
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=200, layout="constrained")
+
+
+def _save(figure: "Figure", out: Path) -> None:
+    """In the sizes of a printed column; set here, for matplotlib's global settings are not ours."""
+    for ax in figure.axes:
+        ax.tick_params(labelsize=8, width=0.6)
+        ax.title.set_fontsize(9)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.label.set_fontsize(8.5)
+            axis.get_offset_text().set_fontsize(7)
+        for spine in ax.spines.values():
+            spine.set_linewidth(0.6)
+    figure.savefig(out)
+
+
+# --- files ----------------------------------------------------------------------------------------------
+
+
+def _read_case(directory: Path) -> dict[str, Any]:
+    case: dict[str, Any] = json.loads((directory / "case.json").read_text())
+    return case
+
+
+def _open(directory: Path) -> "zarr.Group":
+    import zarr
+
+    if not (directory / "snapshots.zarr").is_dir():
+        raise PlotError(f"{directory} has no snapshots to draw")
+    return zarr.open_group(directory / "snapshots.zarr", mode="r")
+
+
+def _array(group: "zarr.Group", name: str) -> "zarr.Array[Any]":
+    import zarr
+
+    if not isinstance(array := group[name], zarr.Array):
+        raise PlotError(f"snapshots.zarr: {name} is not an array")
+    return array
+
+
+def _nearest(times: Sequence[float] | Floats, time: float, directory: Path) -> int:
+    if not len(times):
+        raise PlotError(f"{directory} has no snapshots to draw")
+    return int(np.argmin(abs(np.asarray(times) - time)))

@@ -4,7 +4,6 @@ Exit status: 0 done, 1 the run failed, 2 the input was refused, 130 interrupted 
 What a command imports beyond the terminal is imported inside it: `frit --help` is quick.
 """
 
-import importlib.metadata
 import json
 import math
 import signal
@@ -12,30 +11,19 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
-from rich.table import Table
 
 from .launch import Launch, LaunchError, Outcome, read_record
 
-if TYPE_CHECKING:
-    from frit.solver.case import Case
-
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
-COLUMNS = (
-    "t {task.fields[time]}",
-    "step {task.fields[step]}",
-    "{task.fields[speed]} ev/s",
-    "live {task.fields[live]}",
-    "vacancy {task.fields[vacancy]}",
-    "{task.fields[remaining]} left",
-)
 
 app = typer.Typer(
     name="frit",
@@ -45,8 +33,16 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def at_least_one(ranks: int | None) -> int | None:
+    """Option callback."""
+    if ranks is not None and ranks < 1:
+        raise typer.BadParameter(f"{ranks}: must be 1 or more")
+    return ranks
+
+
 CaseFile = Annotated[Path, typer.Argument(metavar="CASE.toml", exists=True, dir_okay=False, help="Or JSON.")]
-Ranks = Annotated[int, typer.Option(min=1, metavar="N", help="MPI ranks.")]
+Ranks = Annotated[int, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False)]
 
@@ -66,13 +62,16 @@ def refuse(*lines: str) -> NoReturn:
 def show_version(wanted: bool) -> None:
     """Option callback."""
     if wanted:
-        typer.echo(f"frit {importlib.metadata.version('frit')}")
+        try:
+            typer.echo(f"frit {version('frit')}")
+        except PackageNotFoundError:
+            typer.echo("frit, not installed")
         raise typer.Exit
 
 
 @app.callback()
 def frit(
-    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True)] = False,
+    _version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True)] = False,
 ) -> None:
     """Options before the command."""
 
@@ -87,22 +86,21 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run one case here; Ctrl-C writes a checkpoint and ends."""
-    name = read_case(case).name
+    check_case(case)
     directory = out or Path("runs") / case.stem
     state = read_record(directory).get("state")
     if (directory / "run.json").exists() and state != "refused":
-        refuse(
-            f"--out {directory}: the folder holds a run already (state: {state})",
-            f"`frit resume {directory}` goes on with it; --out DIR names another folder",
-        )
-    follow(name, ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json)
+        resumable = (directory / "checkpoint.h5").exists()
+        way = f"`frit resume {directory}` goes on with it" if resumable else "it has no checkpoint: remove it"
+        refuse(f"--out {directory}: holds a run already (state: {state})", f"{way}, or name another folder")
+    follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json)
 
 
 @app.command()
 def resume(
     directory: RunDirectory,
     ranks: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="MPI ranks; default: as before.")
+        int | None, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks; default: as before.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -115,7 +113,7 @@ def resume(
     if not (directory / "checkpoint.h5").exists():
         refuse(f"{directory} has no checkpoint.h5 to go on from: start its case anew with `frit run`")
     ranks = ranks or int(record.get("ranks", 1))
-    follow(directory.name, ranks, ["--resume", str(directory), "--progress"], directory, as_json)
+    follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
 
 
 @app.command()
@@ -125,7 +123,7 @@ def plot(
         float | None, typer.Option(metavar="T", help="Model time; the nearest snapshot is shown.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: in DIR; also .pdf, .svg.")
+        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: in DIR; .pdf, .svg too.")
     ] = None,
 ) -> None:
     """Picture of the snapshot nearest to --time; of the history without it."""
@@ -153,12 +151,12 @@ def schema() -> None:
     typer.echo(json.dumps(case_schema(), indent=2))
 
 
-def read_case(path: Path) -> "Case":
-    """The checked case; a wrong one is refused with a line per problem."""
+def check_case(path: Path) -> None:
+    """Refuse a wrong case with a line per problem."""
     from frit.solver.case import CaseError, load_case
 
     try:
-        return load_case(path)
+        load_case(path)
     except CaseError as error:
         refuse(*(f"{path}: {line}" for line in str(error).splitlines()))
 
@@ -166,16 +164,18 @@ def read_case(path: Path) -> "Case":
 # --- following a launch ---------------------------------------------------------------------------------
 
 
-def follow(name: str, ranks: int, arguments: list[str], directory: Path, as_json: bool) -> NoReturn:
+def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool) -> NoReturn:
     """Launch the solver, show its progress to the end, and leave with the exit status of its outcome."""
     try:
         launch = Launch(ranks, arguments, directory)
     except (LaunchError, OSError) as error:
         refuse(str(error))
     start, progress = monotonic(), dict[str, Any]()
-    with launch, progress_bar(name) as (bar, task), signals_passed_on(launch, bar, task):
+    with launch, progress_bar() as (bar, task), signals_passed_on(launch, bar, task):
         for progress in launch:
-            bar.update(task, completed=progress.get("time"), total=progress.get("end"), **shown(progress))
+            bar.update(task, completed=progress.get("time"), total=progress.get("end"))
+            if not launch.stopping:
+                bar.update(task, description=in_words(progress))
         outcome = launch.wait()
     report(directory, outcome, progress, monotonic() - start, as_json)
     raise typer.Exit(EXIT[outcome.state])
@@ -203,35 +203,28 @@ def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[N
 
 
 @contextmanager
-def progress_bar(name: str) -> Iterator[tuple[Progress, TaskID]]:
+def progress_bar() -> Iterator[tuple[Progress, TaskID]]:
     """On stderr, and only where somebody sees it."""
-    bar = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=16),
-        *(TextColumn(column, markup=False) for column in COLUMNS),
-        console=Console(stderr=True),
-        disable=not (sys.stdout.isatty() and sys.stderr.isatty()),
-    )
-    with bar:
-        yield bar, bar.add_task(name, total=None, **shown({}))
+    seen = sys.stdout.isatty() and sys.stderr.isatty()
+    text = TextColumn("{task.description}", markup=False)
+    with Progress(BarColumn(bar_width=12), text, console=Console(stderr=True), disable=not seen) as bar:
+        yield bar, bar.add_task("starting", total=None)
 
 
-def shown(progress: dict[str, Any]) -> dict[str, Any]:
-    """A progress line in words; what rank 0 does not know yet is a dash."""
+def in_words(progress: dict[str, Any]) -> str:
+    """A progress line; what rank 0 does not know yet is a dash."""
 
     def word(key: str, form: str) -> str:
         value = progress.get(key)
         return "-" if value is None else format(value, form)
 
-    left = progress.get("remaining")
-    return {
-        "time": f"{word('time', '.4g')}/{word('end', '.4g')}",
-        "step": word("step", "d"),
-        "speed": word("evaluations_per_second", ".3g"),
-        "live": word("live_fraction", ".0%"),
-        "vacancy": word("vacancy_ratio", ".4f"),
-        "remaining": "-" if left is None else str(timedelta(seconds=round(left))),
-    }
+    seconds = progress.get("remaining")
+    left = "-" if seconds is None else timedelta(seconds=round(seconds))
+    return (
+        f"t {word('time', '.4g')}/{word('end', '.4g')} step {word('step', 'd')}"
+        f" {word('evaluations_per_second', '.3g')} ev/s live {word('live_fraction', '.0%')}"
+        f" vacancy {word('vacancy_ratio', '.4f')} {left} left"
+    )
 
 
 def report(
@@ -242,20 +235,19 @@ def report(
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
-        table = Table(show_header=False, box=None)
         for key, value in summary.items():
             values = value if isinstance(value, list) else [value]
-            table.add_row(key.replace("_", " "), " -> ".join(in_words(v) for v in values))
-        Console().print(table, highlight=False, markup=False)
+            typer.echo(f"{key.replace('_', ' '):15}{' -> '.join(map(cell, values))}")
     if outcome.state in ("failed", "refused"):
-        lines = [outcome.errors, outcome.message, f"see {directory / 'log.txt'}"]
+        log = directory / "log.txt"
+        lines = [outcome.errors, outcome.message, f"see {log}" if log.exists() else None]
         typer.echo("\n".join(filter(None, lines)), err=True)
     elif outcome.state == "interrupted":
-        typer.echo(f"interrupted; `frit resume {directory}` goes on", err=True)
+        typer.echo(f"interrupted ({outcome.message}); `frit resume {directory}` goes on", err=True)
 
 
-def in_words(value: object) -> str:
-    """A cell of the summary."""
+def cell(value: object) -> str:
+    """Of the summary's table."""
     return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -276,7 +268,7 @@ def summarise(
         "time": finite(last.get("time")),
         "steps": last.get("step"),
         "evaluations": last.get("evaluations"),
-        "wall_time": last.get("wall_time") if wall_time is None else round(wall_time, 2),
+        "wall_time": round(last.get("wall_time", 0.0) if wall_time is None else wall_time, 2),
         "vacancy_ratio": [finite(v) for v in (*first, last.get("vacancy_ratio"))],
         "directory": str(directory),
     }

@@ -1,6 +1,5 @@
 """Start the solver under MPI, follow it, stop it, judge its end. Knows no terminal and no database."""
 
-import fcntl
 import json
 import os
 import shutil
@@ -19,14 +18,16 @@ from pathlib import Path
 from typing import Any, Self
 
 ENDS = ("done", "failed", "interrupted", "refused")
-SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL")  # PMI covers PMIX
+# An outer MPI or Slurm step, which the ranks would join (PMI covers PMIX); and what makes Python write a printed
+# line in two parts, between which another rank's gets.
+SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL", "PYTHONUNBUFFERED")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM")
 OPEN_MPI = dict.fromkeys(AS_ROOT, "1") | {"OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self,sm"}
 
 
 class LaunchError(RuntimeError):
-    """Nothing was started: no mpirun, or the run directory is in use."""
+    """Nothing was started: there is no mpirun."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def mpirun_command(ranks: int, arguments: Sequence[str]) -> list[str]:
 
 
 def clean_environment(environ: Mapping[str, str]) -> dict[str, str]:
-    """Without an outer MPI or Slurm step, which the ranks would join; one thread a rank unless set."""
+    """Without what is SCRUBBED; one thread a rank unless set."""
     kept = {key: value for key, value in environ.items() if not key.startswith(SCRUBBED)}
     return dict.fromkeys(THREADS, "1") | kept
 
@@ -86,7 +87,7 @@ class Launch:
     """One mpirun tree in a session of its own: a terminal's Ctrl-C reaches only its parent.
 
     Iterate over the progress, then wait(); leaving the `with` block kills what is left. If the parent is
-    killed -9 the tree may go on, and then holds the lock of the directory: nobody resumes it a second time.
+    killed -9 the tree may go on; the solver's own lock then keeps others out of the directory.
     """
 
     def __init__(self, ranks: int, arguments: Sequence[str], directory: Path) -> None:
@@ -98,22 +99,17 @@ class Launch:
         self.directory, self.stopping = directory, False
         self._spoken: deque[str] = deque(maxlen=40)
         directory.mkdir(parents=True, exist_ok=True)
-        lock = _lock(directory)
         self._record_before = _stamp(directory / "run.json")
-        try:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                encoding="utf-8",
-                errors="replace",
-                env=environment,
-                pass_fds=[lock],
-                start_new_session=True,
-            )
-        finally:
-            os.close(lock)
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            errors="replace",
+            env=environment,
+            start_new_session=True,
+        )
         self._reaper = threading.Thread(target=self._reap, daemon=True)
         self._reaper.start()
 
@@ -173,10 +169,14 @@ class Launch:
             return Outcome(record["state"], record.get("message"), code, spoken)
         if self.stopping and (self.directory / "checkpoint.h5").exists():
             return Outcome("interrupted", "no new checkpoint was written; the last one stands", code, spoken)
+        if self.stopping:
+            return Outcome("failed", "stopped before the first checkpoint was written", code, spoken)
+        if code == 2:  # another's directory: the solver said so on stderr and left run.json alone
+            return Outcome("refused", None, code, spoken)
         return Outcome("failed", f"mpirun ended with status {code} and no word of the solver", code, spoken)
 
     def _reap(self) -> None:
-        """mpirun's end is the end of all: no orphan stays, and the lock is free when wait() returns."""
+        """mpirun's end is the end of all: no orphan stays, and the directory is free when wait() returns."""
         self._process.wait()
         for _ in range(100):
             if not self.kill():
@@ -187,16 +187,3 @@ class Launch:
 def _stamp(path: Path) -> tuple[int, int] | None:
     """Differs once the file is replaced or written anew."""
     return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
-
-
-def _lock(directory: Path) -> int:
-    """A descriptor for the tree to inherit: it holds the directory until the last process is gone."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise LaunchError(f"{directory} is in use by a run that has not ended") from None
-    except OSError:
-        pass  # a network file system without such locks
-    return descriptor

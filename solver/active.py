@@ -27,7 +27,10 @@ class Active:
     """The live points and their surroundings at one moment; arrays over this rank's points and nodes."""
 
     live: Integers  # (L,) numbers of the live points
-    owner: Numbers  # (L, F - 1) particle of each slot at the live points, -1: none
+    owner: Numbers  # (L, slots) particle of each slot at the live points, -1: none
+    mask: Floats  # (L, F) 1 for rho and the slots that exist at the live points, else 0
+    present: NDArray[np.bool_]  # (L, F / LANES) packs of columns that hold anything
+    several: NDArray[np.bool_]  # (L,) points that see more than one particle
     nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
     owned: Integers  # those of them that this rank owns
     potential: Floats  # (n,) what this rank's still points owe to W, times m_a
@@ -56,12 +59,15 @@ def activate(d: Discretisation, state: State) -> Active:
     table = d.shape
     low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
     high = np.full(d.nodes, -1, dtype=np.int64)
-    kernels.interiors(low, high, flags, owner, state.u, table.offsets, table.nodes, table.table)
+    kernels.interiors(low, high, flags, owner, state.u, table.offsets, table.nodes, table.rows, table.table)
     _spread(d, low, high)
     mixed = low < high
     if mixed.any():
         flags[np.logical_or.reduceat(mixed[table.nodes], table.offsets[:-1])] = 1
     live = np.flatnonzero(flags)
+    mask = np.zeros((live.size, state.u.shape[1]))
+    mask[:, 0] = 1.0
+    mask[:, 1 : 1 + owner.shape[1]] = owner[live] >= 0
     moving, resting = _touched(d, flags != 0), _touched(d, flags == 0)
     edge_nodes = np.flatnonzero(moving & resting & (high >= 0))
     potential, drift = _still_shares(d, state, flags, owner, edge_nodes, high)
@@ -73,6 +79,9 @@ def activate(d: Discretisation, state: State) -> Active:
     return Active(
         live=live,
         owner=owner[live],
+        mask=mask,
+        present=(mask != 0.0).reshape(live.size, -1, LANES).any(axis=2),
+        several=mask.sum(axis=1) > 2.0,
         nodes=np.flatnonzero(moving),
         owned=d.share.owned[moving[d.share.owned]],
         potential=potential,
@@ -139,7 +148,7 @@ def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]
     clash = np.empty((table.points, 2), dtype=np.int64)
     kernels.sense(
         flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, d.dim,
-        table.offsets, table.nodes, table.table,
+        table.offsets, table.nodes, table.rows, table.table,
     )
     return flags, owner, clash
 
@@ -180,7 +189,8 @@ def _still_shares(
     drift = np.zeros((edge_nodes.size, 2, d.dim + rotations(d.dim)))
     kernels.still_shares(
         potential, drift, flags, edge, owner, state.u, d.weights, d.x,
-        table.offsets, table.nodes, table.table, d.coefficients, d.huang,
+        table.offsets, table.nodes, table.rows, table.table, np.empty((1, table.longest)),
+        d.coefficients, d.huang,
     )
     particle = interior[edge_nodes]
     excess = np.zeros((len(state.slot_of), *drift.shape[1:]))

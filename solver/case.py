@@ -14,7 +14,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import count, takewhile
+from itertools import count, pairwise, takewhile
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -50,9 +50,7 @@ Text = Annotated[str, Field(strict=True)]
 Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
 Box = tuple[Point, Point]
-Key = Sequence[
-    str | int
-]  # where pydantic found a value: names, indices, and "|form" where a value has two forms
+Place = tuple[str | int, ...]  # of a value in the tree: names, indices, and "|form" where it may have two
 
 
 @dataclass(frozen=True)
@@ -65,9 +63,7 @@ class Problem:
 
     def __str__(self) -> str:
         shown = text if len(text := repr(self.value)) <= 80 else text[:77] + "..."
-        return (
-            f"{self.key}: {self.allowed}" if self.value is None else f"{self.key} = {shown}: {self.allowed}"
-        )
+        return f"{self.key}{'' if self.value is None else f' = {shown}'}: {self.allowed}"
 
 
 class CaseError(ValueError):
@@ -75,7 +71,10 @@ class CaseError(ValueError):
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
-        super().__init__("\n".join(map(str, self.problems)))
+        super().__init__(self.problems)
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self.problems))
 
 
 def _refuse(problems: Iterable[Problem]) -> None:
@@ -108,11 +107,10 @@ class Table(BaseModel):
     @model_validator(mode="after")
     def _fields_fit_switches(self) -> Self:
         setting = tuple(getattr(self, switch) for switch in self.switches)
-        words = ", ".join(
-            f"{switch} = {value!r}" for switch, value in zip(self.switches, setting, strict=True)
-        )
+        said = [f"{switch} = {getattr(self, switch)!r}" for switch in self.switches]
+        words = ", ".join(said)
         if setting not in self.owned:
-            raise CaseError([Problem(self.switches[-1], setting[-1], f"not possible with {words}")])
+            raise CaseError([Problem(self.switches[-1], setting[-1], f"not possible with {said[0]}")])
         own = self.owned[setting]
         names = {name for fields in self.owned.values() for name in fields}
         given = {name: value for name in sorted(names) if (value := getattr(self, name)) not in (None, ())}
@@ -392,9 +390,7 @@ class Case(Table):
     def _tables_agree(self) -> Self:
         listed = (_particles_inside, _particles_apart) if self.particles.source == "list" else ()
         checks = (*listed, _particles_resolved, _boxes_inside, _times_in_order)
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # absurdly large numbers are refused, not warned of
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused, not warned of
             _refuse(problem for check in checks for problem in check(self))
         return self
 
@@ -449,10 +445,9 @@ def _outside(lower: Floats, upper: Floats, case: Case) -> NDArray[np.bool_]:
 
 def _particles_inside(case: Case) -> Iterator[Problem]:
     centres, half = case.particles.extents()
+    domain = f"must stay in the domain, {list(case.domain.size)}"
     for i in np.flatnonzero(_outside(centres - half, centres + half, case)):
-        allowed = (
-            f"reaches {half[i].tolist()} to each side, must stay in the domain, {list(case.domain.size)}"
-        )
+        allowed = f"reaches {half[i].tolist()} to each side, {domain}"
         yield Problem(f"particles.centres[{i}]", centres[i].tolist(), allowed)
 
 
@@ -484,13 +479,11 @@ def _boxes_inside(case: Case) -> Iterator[Problem]:
     for key, box in boxes.items():
         if box is None:
             continue
-        lower, upper = np.array(box[0]), np.array(box[1])
+        lower, upper = np.array(box)
         if (lower >= upper).any():
-            yield Problem(
-                key, [*map(list, box)], "must be [lower corner, upper corner], lower along every axis"
-            )
+            yield Problem(key, list(box), "must be [lower corner, upper corner], lower along every axis")
         elif _outside(lower, upper, case):
-            yield Problem(key, [*map(list, box)], f"must be inside the domain, {list(case.domain.size)}")
+            yield Problem(key, list(box), f"must be inside the domain, {list(case.domain.size)}")
 
 
 def _times_in_order(case: Case) -> Iterator[Problem]:
@@ -498,13 +491,11 @@ def _times_in_order(case: Case) -> Iterator[Problem]:
     if step is not None and step > end:
         yield Problem("time.step", step, f"must be at most time.end, {end}")
     times = () if isinstance(snapshots, Every) else snapshots
-    for i, t in enumerate(times):
+    for i, (before, t) in enumerate(pairwise((-math.inf, *times))):
         if t > end:
             yield Problem(f"output.snapshots[{i}]", t, f"must be at most time.end, {end}")
-        if i and t <= times[i - 1]:
-            yield Problem(
-                f"output.snapshots[{i}]", t, f"must be greater than the time before, {times[i - 1]}"
-            )
+        if t <= before:
+            yield Problem(f"output.snapshots[{i}]", t, f"must be greater than the time before, {before}")
 
 
 # --- reading
@@ -526,9 +517,8 @@ def load_case(path: Path | str) -> Case:
     except OSError as error:
         raise CaseError([Problem(str(path), None, f"cannot be read: {error.strerror}")]) from error
     except (ValueError, RecursionError) as error:
-        raise CaseError(
-            [Problem(str(path), None, f"not valid {path.suffix[1:].upper()}: {error}")]
-        ) from error
+        kind = path.suffix[1:].upper()
+        raise CaseError([Problem(str(path), None, f"not valid {kind}: {error}")]) from error
     return parse_case(tree, base=path.parent)
 
 
@@ -550,7 +540,7 @@ def _problems(error: ValidationError) -> Iterator[Problem]:
     for entry in entries:
         loc, kind, cause = entry["loc"], entry["type"], entry.get("ctx", {}).get("error")
         if isinstance(cause, CaseError):
-            yield from (replace(problem, key=_dotted([*loc, problem.key])) for problem in cause.problems)
+            yield from (replace(problem, key=_dotted((*loc, problem.key))) for problem in cause.problems)
         elif kind == "too_short" and loc in inside:
             continue  # it counts the refused items as lacking
         elif kind == "missing":
@@ -562,12 +552,12 @@ def _problems(error: ValidationError) -> Iterator[Problem]:
             yield Problem(_dotted(loc), entry["input"], _known(loc) if kind == "extra_forbidden" else allowed)
 
 
-def _dotted(loc: Key) -> str:
+def _dotted(loc: Place) -> str:
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if str(part)[:1] != "|")
     return "".join(parts).removeprefix(".") or "case"
 
 
-def _table(loc: Key) -> type[BaseModel]:
+def _table(loc: Place) -> type[BaseModel]:
     """The table that holds the key at `loc`."""
     table: Any = Case
     for part in loc[:-1]:
@@ -575,7 +565,7 @@ def _table(loc: Key) -> type[BaseModel]:
     return table  # type: ignore[no-any-return]
 
 
-def _known(loc: Key) -> str:
+def _known(loc: Place) -> str:
     known = list(_table(loc).model_fields)
     close = difflib.get_close_matches(str(loc[-1]), known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
@@ -589,15 +579,13 @@ def _read_csv(path: str, dim: int) -> tuple[tuple[Point, ...], tuple[float, ...]
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise CaseError([Problem("path", path, f"cannot be read: {error}")]) from error
-    table = [
-        (number, [cell.strip() for cell in line.split(",")]) for number, line in enumerate(lines, start=1)
-    ]
-    table = [(number, cells) for number, cells in table if cells != [""] and not cells[0].startswith("#")]
-    if table and [cell.lower() for cell in table[0][1]] == names:
-        del table[0]
-    wrong = [text for number, cells in table for text in _wrong_cells(number, cells, names)]
+    table = {n: [cell.strip() for cell in line.split(",")] for n, line in enumerate(lines, start=1)}
+    table = {n: cells for n, cells in table.items() if cells != [""] and not cells[0].startswith("#")}
+    if table and [cell.lower() for cell in table[min(table)]] == names:
+        del table[min(table)]
+    wrong = [text for n, cells in table.items() for text in _wrong_cells(n, cells, names)]
     _refuse(Problem("path", path, text) for text in (wrong if table else ["holds no particles"]))
-    rows = [tuple(map(float, cells)) for _, cells in table]
+    rows = [tuple(map(float, cells)) for cells in table.values()]
     return tuple(row[:-1] for row in rows), tuple(row[-1] for row in rows)
 
 

@@ -65,7 +65,7 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     nodes = np.flatnonzero(seen)
     local = np.full(len(mesh.nodes), -1, dtype=np.int32)
     local[nodes] = np.arange(nodes.size, dtype=np.int32)
-    table = ShapeTable(table.offsets, local[table.nodes], table.table)
+    table = ShapeTable(table.offsets, local[table.nodes], table.rows, table.table)
     share = Share(ranks, points, nodes, Halo(ranks, nodes), len(mesh.nodes))
     x = mesh.points[points] - 0.5 * np.asarray(case.domain.size)
     weights = np.ascontiguousarray(mesh.weights[points])
@@ -82,7 +82,7 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
 def _moments(table: ShapeTable, weights: Floats, x: Floats, nodes: int) -> tuple[Floats, Floats]:
     """This rank's parts of m_a and q_a."""
     counts = np.diff(table.offsets)
-    wN = np.repeat(weights, counts) * table.table[:, 0]
+    wN = np.repeat(weights, counts) * table.entries()[0]
     mass = np.bincount(table.nodes, wN, minlength=nodes)
     moment = [np.bincount(table.nodes, wN * np.repeat(x[:, k], counts), minlength=nodes) for k in range(x.shape[1])]
     return mass, np.stack(moment, axis=1)

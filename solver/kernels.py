@@ -1,9 +1,11 @@
 """The loops over material points: gather nodal fields, evaluate the physics, scatter to the nodes.
 
 Layout. `u` (n, F) holds a node's fields side by side: column 0 is rho, column 1 + s is slot s of eta, F is a multiple
-of LANES. The shape-function table is compressed by rows: point p sees nodes[offsets[p] : offsets[p + 1]], and
-table[e] = (N, dN/dx, dN/dy[, dN/dz]) belongs to entry e. `live` lists the points that are integrated, l counts along
-it, and owner[l, s] is the particle that slot s means at that point, or -1: such a slot does not exist there.
+of LANES. Point p sees nodes[offsets[p] + i] for i < offsets[p + 1] - offsets[p], with the shape functions
+table[:, rows[p] + i] = (N, dN/dx, dN/dy[, dN/dz]); on a lattice most points share
+one row of the table. Rows start at multiples of LANES and are filled up with zeros. `live` lists the points that are integrated, l counts along
+it, and owner[l, s] is the particle that slot s means at that point, or -1: such a slot does not exist there, mask[l] is
+0 in its column, and present[l, b] tells whether pack b of columns holds anything at all.
 Point fields are kept in `point` (L (1 + dim), F): row l (1 + dim) holds the values at live point l, the next dim rows
 their derivatives.
 """
@@ -11,25 +13,26 @@ their derivatives.
 import numpy as np
 
 from .energy import df_deta, df_drho, free_energy_density, mobility
-from .jit import jit
-from .simd import LANES, fma, load, splat, store
+from .jit import inlined, jit
+from .simd import LANES, first, load, positive, splat, store, total, with_first
 
 
-@jit
-def gather(point, u, row, first, last, nodes, table, column):
+@inlined
+def gather(point, u, row, begin, count, start, nodes, table, column):
     """u_p = sum_a N_a(x_p) u_a and grad u_p = sum_a grad N_a(x_p) u_a for one point and one pack of fields   (17)"""
-    dim = table.shape[1] - 1
+    dim = table.shape[0] - 1
     value = splat(0.0)
     x = splat(0.0)
     y = splat(0.0)
     z = splat(0.0)
-    for e in range(first, last):
-        field = load(u, nodes[e], column)
-        value = fma(table[e, 0], field, value)
-        x = fma(table[e, 1], field, x)
-        y = fma(table[e, 2], field, y)
+    for i in range(count):
+        e = start + i
+        field = load(u, nodes[begin + i], column)
+        value = value + table[0, e] * field
+        x = x + table[1, e] * field
+        y = y + table[2, e] * field
         if dim == 3:
-            z = fma(table[e, 3], field, z)
+            z = z + table[3, e] * field
     store(point, row, column, value)
     store(point, row + 1, column, x)
     store(point, row + 2, column, y)
@@ -37,48 +40,61 @@ def gather(point, u, row, first, last, nodes, table, column):
         store(point, row + 3, column, z)
 
 
-@jit
-def scatter(rate, point, row, first, last, nodes, table, column):
+@inlined
+def scatter(rate, point, row, begin, count, start, nodes, table, column):
     """rate_a += N_a(x_p) s_p + grad N_a(x_p) . j_p for one point's sources s and fluxes j (the rows of `point`)."""
-    dim = table.shape[1] - 1
+    dim = table.shape[0] - 1
     source = load(point, row, column)
     x = load(point, row + 1, column)
     y = load(point, row + 2, column)
-    z = source
-    if dim == 3:
-        z = load(point, row + 3, column)
-    for e in range(first, last):
-        a = nodes[e]
-        new = fma(table[e, 0], source, fma(table[e, 1], x, fma(table[e, 2], y, load(rate, a, column))))
+    z = load(point, row + dim, column)
+    for i in range(count):
+        e = start + i
+        a = nodes[begin + i]
+        new = load(rate, a, column) + table[0, e] * source + table[1, e] * x + table[2, e] * y
         if dim == 3:
-            new = fma(table[e, 3], z, new)
+            new = new + table[3, e] * z
         store(rate, a, column, new)
 
 
-@jit
-def has_fields(owner, l, column):
-    """Whether the pack that starts at `column` holds rho or a slot with an owner at live point l."""
-    if column == 0:
-        return True
-    for s in range(column - 1, column - 1 + LANES):
-        if owner[l, s] >= 0:
-            return True
-    return False
+@inlined
+def add_potential(W, w, row, point, rho, S2, S3, begin, count, start, nodes, table, work, m):
+    """W_a += w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]: one point's share of (24), before the 1/m_a.
 
-
-@jit
-def add_potential(W, w, row, point, S2, S3, first, last, nodes, table, m):
-    """W_a += w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]: one point's share of (24), before the 1/m_a."""
-    dim = table.shape[1] - 1
-    source = w * df_drho(point[row, 0], S2, S3, m)
+    work (1, longest row of the table) holds the shares while they are computed in packs along the row.
+    """
+    dim = table.shape[0] - 1
+    source = w * df_drho(rho, S2, S3, m)
     x = w * m.kappa_rho * point[row + 1, 0]
     y = w * m.kappa_rho * point[row + 2, 0]
     z = w * m.kappa_rho * point[row + dim, 0]
-    for e in range(first, last):
-        share = table[e, 0] * source + table[e, 1] * x + table[e, 2] * y
+    for i in range(0, count, LANES):
+        e = start + i
+        share = source * load(table, 0, e) + x * load(table, 1, e) + y * load(table, 2, e)
         if dim == 3:
-            share += table[e, 3] * z
-        W[nodes[e]] += share
+            share = share + z * load(table, 3, e)
+        store(work, 0, i, share)
+    for i in range(count):
+        W[nodes[begin + i]] += work[0, i]
+
+
+@inlined
+def gradient(result, W, begin, count, start, nodes, table, work):
+    """result = sum_a grad N_a(x_p) W_a at one point   (23)"""
+    for i in range(count):
+        work[0, i] = W[nodes[begin + i]]
+    x = splat(0.0)
+    y = splat(0.0)
+    z = splat(0.0)
+    for i in range(0, count, LANES):
+        value = load(work, 0, i)
+        x = x + value * load(table, 1, start + i)
+        y = y + value * load(table, 2, start + i)
+        if table.shape[0] == 4:
+            z = z + value * load(table, 3, start + i)
+    result[0] = total(x)
+    result[1] = total(y)
+    result[2] = total(z)
 
 
 @jit
@@ -122,42 +138,55 @@ def add_contact(force, point, row, l, owner, w, x, m):
 
 
 @jit
-def potential(W, force, point, D, u, live, owner, weights, x, offsets, nodes, table, m, rigid):
+def potential(
+    W, force, point, D, squares, u, live, owner, mask, present, several, weights, x, offsets, nodes, rows, table,
+    work, m, rigid,
+):
     """First half of an evaluation: fields at the live points, D, their shares of W, and the contact forces.
 
-    W (n,) gets partial sums, force (particles, dim + rotations) is added to where `rigid`; point and D are filled.
+    W (n,) gets partial sums, force (particles, dim + rotations) is added to where `rigid`; point, D and squares = S2
+    are filled.
     """
     width = 1 + x.shape[1]
-    slots = owner.shape[1]
     for l in range(live.size):
         p = live[l]
         row = l * width
-        first = offsets[p]
-        last = offsets[p + 1]
-        for column in range(0, u.shape[1], LANES):
-            if has_fields(owner, l, column):
-                gather(point, u, row, first, last, nodes, table, column)
+        begin = offsets[p]
+        count = offsets[p + 1] - begin
+        start = rows[p]
         S1 = 0.0
         S2 = 0.0
         S3 = 0.0
         P2 = 0.0
-        grains = 0
-        for s in range(slots):
-            if owner[l, s] >= 0:
-                eta = point[row, 1 + s]
-                S2 += eta * eta
-                S3 += eta * eta * eta
-                positive = max(eta, 0.0)
-                S1 += positive
-                P2 += positive * positive
-                grains += 1
-        D[l] = mobility(point[row, 0], S1 * S1 - P2, m)
-        add_potential(W, weights[p], row, point, S2, S3, first, last, nodes, table, m)
-        if rigid and grains > 1:
+        rho = 0.0
+        for b in range(present.shape[1]):
+            if not present[l, b]:
+                continue
+            column = b * LANES
+            gather(point, u, row, begin, count, start, nodes, table, column)
+            exists = load(mask, l, column)
+            eta = exists * load(point, row, column)
+            store(point, row, column, eta)
+            for k in range(1, width):
+                store(point, row + k, column, exists * load(point, row + k, column))
+            if b == 0:
+                rho = first(eta)
+                eta = with_first(eta, 0.0)
+            square = eta * eta
+            if several[l]:
+                inside = positive(eta)
+                S1 += total(inside)
+                P2 += total(inside * inside)
+            S2 += total(square)
+            S3 += total(square * eta)
+        squares[l] = S2
+        D[l] = mobility(rho, S1 * S1 - P2, m)
+        add_potential(W, weights[p], row, point, rho, S2, S3, begin, count, start, nodes, table, work, m)
+        if rigid and several[l]:
             add_contact(force, point, row, l, owner, weights[p], x[p], m)
 
 
-@jit
+@inlined
 def rigid_velocity(motion, a, x, k, dim):
     """Component k of V_a(x) = v_a + omega_a cross x; motion[a] = (v_a, omega_a), v_a taken at the origin of x."""
     if dim == 2:
@@ -167,72 +196,70 @@ def rigid_velocity(motion, a, x, k, dim):
     return motion[a, k] + motion[a, 3 + i] * x[j] - motion[a, 3 + j] * x[i]
 
 
+@inlined
+def fill_velocities(velocity, motion, owner, l, x):
+    """velocity[k, 1 + s] = component k of V_a(x), a = owner[l, s]; 0 where a slot does not exist."""
+    for s in range(owner.shape[1]):
+        a = owner[l, s]
+        for k in range(x.shape[0]):
+            velocity[k, 1 + s] = rigid_velocity(motion, a, x, k, x.shape[0]) if a >= 0 else 0.0
+
+
 @jit
-def divergence(rate, point, D, W, motion, live, owner, weights, x, offsets, nodes, table, m, rigid, huang):
+def divergence(
+    rate, point, D, squares, W, motion, velocity, live, owner, present, weights, x, offsets, nodes, rows,
+    table, work, m, rigid, huang,
+):
     """Second half of an evaluation: the fluxes at the live points, scattered to the nodes   (20), (21)
 
     rate (n, F) gets partial sums, before the 1/m_a. The rows of `point` are turned from fields into sources and fluxes:
     rho:   source 0,               flux -D grad W + rho v_adv
     eta_a: source -L df/deta_a,    flux -L kappa_eta grad eta_a + eta_a v_a,    v_a = V_a(x) eta_a
+    velocity (dim, F) is work space with zeros in column 0.
     """
     dim = x.shape[1]
-    slots = owner.shape[1]
     advection = np.zeros(3)
+    slope = np.zeros(3)
     for l in range(live.size):
         p = live[l]
         row = l * (1 + dim)
-        first = offsets[p]
-        last = offsets[p + 1]
+        begin = offsets[p]
+        count = offsets[p + 1] - begin
+        start = rows[p]
         w = weights[p]
-        gx = 0.0
-        gy = 0.0
-        gz = 0.0
-        for e in range(first, last):
-            value = W[nodes[e]]
-            gx += table[e, 1] * value
-            gy += table[e, 2] * value
-            if dim == 3:
-                gz += table[e, 3] * value
+        gradient(slope, W, begin, count, start, nodes, table, work)
         rho = point[row, 0]
-        S2 = 0.0
-        for s in range(slots):
-            if owner[l, s] >= 0:
-                S2 += point[row, 1 + s] ** 2
-        advection[:] = 0.0
-        for s in range(slots):
-            a = owner[l, s]
-            column = 1 + s
-            if a < 0:
-                for k in range(1 + dim):
-                    point[row + k, column] = 0.0
+        if rigid:
+            advection[:] = 0.0
+            fill_velocities(velocity, motion, owner, l, x[p])
+        for b in range(present.shape[1] - 1, -1, -1):
+            if not present[l, b]:
                 continue
-            eta = point[row, column]
-            point[row, column] = -w * m.L * df_deta(eta, rho, S2, m)
+            column = b * LANES
+            eta = load(point, row, column)
+            if b == 0:
+                eta = with_first(eta, 0.0)
+            store(point, row, column, (-w * m.L) * df_deta(eta, rho, squares[l], m))
             for k in range(dim):
-                flux = -m.L * m.kappa_eta * point[row + 1 + k, column]
+                flux = (-m.L * m.kappa_eta) * load(point, row + 1 + k, column)
                 if rigid:
-                    v = rigid_velocity(motion, a, x[p], k, dim) * eta
-                    flux += eta * v
-                    advection[k] += eta * v if huang else v
-                point[row + 1 + k, column] = w * flux
-        point[row, 0] = 0.0
-        point[row + 1, 0] = w * (rho * advection[0] - D[l] * gx)
-        point[row + 2, 0] = w * (rho * advection[1] - D[l] * gy)
-        if dim == 3:
-            point[row + 3, 0] = w * (rho * advection[2] - D[l] * gz)
-        for column in range(0, rate.shape[1], LANES):
-            if has_fields(owner, l, column):
-                scatter(rate, point, row, first, last, nodes, table, column)
+                    v = load(velocity, k, column) * eta
+                    flux = flux + eta * v
+                    advection[k] += total(eta * v) if huang else total(v)
+                if b == 0:
+                    flux = with_first(flux, rho * advection[k] - D[l] * slope[k])
+                store(point, row + 1 + k, column, w * flux)
+            scatter(rate, point, row, begin, count, start, nodes, table, column)
 
 
 @jit
-def free_energy(u, weights, dim, offsets, nodes, table, m):
+def free_energy(u, weights, dim, offsets, nodes, rows, table, m):
     """F = sum_p w_p [ f + kappa_rho/2 |grad rho|^2 + kappa_eta/2 sum |grad eta|^2 ] over all points of this rank   (1)"""
     point = np.empty((1 + dim, u.shape[1]))
     total = 0.0
     for p in range(weights.size):
         for column in range(0, u.shape[1], LANES):
-            gather(point, u, 0, offsets[p], offsets[p + 1], nodes, table, column)
+            gather(point, u, 0, offsets[p], offsets[p + 1] - offsets[p], rows[p], nodes, table, column)
         S2 = 0.0
         S3 = 0.0
         squares = 0.0
@@ -250,7 +277,7 @@ def free_energy(u, weights, dim, offsets, nodes, table, m):
 
 
 @jit
-def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, nodes, table):
+def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, nodes, rows, table):
     """Mark the points where something happens and name the particles that their slots mean (section 2.4).
 
     flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s] is the particle found in slot s
@@ -260,7 +287,7 @@ def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, no
     slots = node_owner.shape[1]
     for p in range(flags.size):
         for column in range(0, u.shape[1], LANES):
-            gather(point, u, 0, offsets[p], offsets[p + 1], nodes, table, column)
+            gather(point, u, 0, offsets[p], offsets[p + 1] - offsets[p], rows[p], nodes, table, column)
         flags[p] = 0
         for c in range(1 + slots):
             square = 0.0
@@ -303,12 +330,12 @@ def claim(node_owner, clash, marked, owner, offsets, nodes):
 
 
 @jit
-def interiors(low, high, flags, owner, u, offsets, nodes, table):
+def interiors(low, high, flags, owner, u, offsets, nodes, rows, table):
     """low[a], high[a]: smallest and largest particle number whose switched-off interior (eta > 1/2) reaches node a."""
     for p in range(flags.size):
         if flags[p]:
             continue
-        slot = interior_slot(u, p, owner, offsets, nodes, table)
+        slot = interior_slot(u, p, owner, offsets, nodes, rows, table)
         if slot >= 0:
             for e in range(offsets[p], offsets[p + 1]):
                 low[nodes[e]] = min(low[nodes[e]], owner[p, slot])
@@ -316,13 +343,13 @@ def interiors(low, high, flags, owner, u, offsets, nodes, table):
 
 
 @jit
-def interior_slot(u, p, owner, offsets, nodes, table):
+def interior_slot(u, p, owner, offsets, nodes, rows, table):
     """The slot with eta_p > 1/2 at point p, or -1."""
     for s in range(owner.shape[1]):
         if owner[p, s] >= 0:
             eta = 0.0
-            for e in range(offsets[p], offsets[p + 1]):
-                eta += table[e, 0] * u[nodes[e], 1 + s]
+            for i in range(offsets[p + 1] - offsets[p]):
+                eta += table[0, rows[p] + i] * u[nodes[offsets[p] + i], 1 + s]
             if eta > 0.5:
                 return s
     return -1
@@ -346,7 +373,7 @@ def watch_nodes(watch, flags, owner, node_owner, offsets, nodes):
 
 
 @jit
-def still_shares(W, drift, flags, edge, owner, u, weights, x, offsets, nodes, table, m, huang):
+def still_shares(W, drift, flags, edge, owner, u, weights, x, offsets, nodes, rows, table, work, m, huang):
     """What switched-off points owe to the nodes they share with live ones, as long as their fields stand still.
 
     W (n,) gets their shares of (24). drift (edges, 2, dim + rotations) gets their shares of the advection of rho and of
@@ -358,24 +385,26 @@ def still_shares(W, drift, flags, edge, owner, u, weights, x, offsets, nodes, ta
     for p in range(flags.size):
         if flags[p]:
             continue
-        first = offsets[p]
-        last = offsets[p + 1]
+        begin = offsets[p]
+        count = offsets[p + 1] - begin
+        start = rows[p]
         for column in range(0, u.shape[1], LANES):
-            gather(point, u, 0, first, last, nodes, table, column)
+            gather(point, u, 0, begin, count, start, nodes, table, column)
         S2 = 0.0
         S3 = 0.0
         for c in range(1, u.shape[1]):
             S2 += point[0, c] ** 2
             S3 += point[0, c] ** 3
-        add_potential(W, weights[p], 0, point, S2, S3, first, last, nodes, table, m)
-        slot = interior_slot(u, p, owner, offsets, nodes, table)
+        add_potential(W, weights[p], 0, point, point[0, 0], S2, S3, begin, count, start, nodes, table, work, m)
+        slot = interior_slot(u, p, owner, offsets, nodes, rows, table)
         if slot < 0:
             continue
         eta = point[0, 1 + slot]
         carried = weights[p] * point[0, 0] * (eta * eta if huang else eta)
-        for e in range(first, last):
-            if edge[nodes[e]] >= 0:
-                add_drift(drift[edge[nodes[e]]], carried, weights[p] * eta * eta, table[e], x[p])
+        for i in range(count):
+            at = edge[nodes[begin + i]]
+            if at >= 0:
+                add_drift(drift[at], carried, weights[p] * eta * eta, table[:, start + i], x[p])
 
 
 @jit
@@ -448,7 +477,7 @@ def divide(array, mass, listed):
         a = listed[i]
         inverse = 1.0 / mass[a]
         for column in range(0, array.shape[1], LANES):
-            store(array, a, column, fma(inverse, load(array, a, column), splat(0.0)))
+            store(array, a, column, inverse * load(array, a, column))
 
 
 @jit
@@ -457,7 +486,7 @@ def advance(new, old, dt, rate, listed):
     for i in range(listed.size):
         a = listed[i]
         for column in range(0, new.shape[1], LANES):
-            store(new, a, column, fma(dt, load(rate, a, column), load(old, a, column)))
+            store(new, a, column, load(old, a, column) + dt * load(rate, a, column))
 
 
 @jit
@@ -487,14 +516,13 @@ def first_outside(u, listed, low, high):
 
 
 @jit
-def chebyshev_stage(new, first, before, last, rate, rate_0, c, listed):
+def chebyshev_stage(new, old, before, last, rate, rate_0, c, listed):
     """new = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0 at the listed nodes."""
     for i in range(listed.size):
         a = listed[i]
         for column in range(0, new.shape[1], LANES):
-            y = fma(c[0], load(first, a, column), fma(c[1], load(last, a, column), splat(0.0)))
-            y = fma(c[2], load(before, a, column), fma(c[3], load(rate, a, column), y))
-            store(new, a, column, fma(c[4], load(rate_0, a, column), y))
+            y = c[0] * load(old, a, column) + c[1] * load(last, a, column) + c[2] * load(before, a, column)
+            store(new, a, column, y + c[3] * load(rate, a, column) + c[4] * load(rate_0, a, column))
 
 
 @jit

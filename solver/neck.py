@@ -51,7 +51,7 @@ class Neck:
         points = self.mesh.nodes[numbers[inner]]
         _, nearest = self.points.query(points)
         table = shape_table(self.case, points, self.mesh.spacing[nearest], self.mesh.cells[:0], self.mesh.nodes, self.tree)
-        entries = fields[table.nodes] * table.table[:, :1]
+        entries = fields[table.nodes] * table.entries()[0][:, None]
         values[inner] = np.add.reduceat(entries, table.offsets[:-1], axis=0)
         return values
 

@@ -38,7 +38,7 @@ class Observables:
         kernels.add_moments(moments, u, owned, state.owner, d.mass, d.first_moment)
         sums[0] = d.mass[owned] @ u[owned, 0]
         sums[1] = kernels.free_energy(
-            u, d.weights, d.dim, table.offsets, table.nodes, table.table, d.coefficients
+            u, d.weights, d.dim, table.offsets, table.nodes, table.rows, table.table, d.coefficients
         )
         sums[2:4] = scheme.active.live.size, table.points
         sums[4] = self.box_weights @ u[:, 0]
@@ -87,12 +87,12 @@ def box_weights(case: Case, mesh: Mesh, d: Discretisation, low: Floats, high: Fl
     whole = np.isclose(volumes, d.weights, rtol=1e-12, atol=0.0)
     cut = np.flatnonzero((volumes > 0.0) & ~whole)
     counts = np.diff(d.shape.offsets)
-    inside = np.repeat(np.where(whole, d.weights, 0.0), counts) * d.shape.table[:, 0]
+    inside = np.repeat(np.where(whole, d.weights, 0.0), counts) * d.shape.entries()[0]
     weights = np.zeros(d.share.total)
     np.add.at(weights, d.share.nodes[d.shape.nodes], inside)
     if cut.size:
         cells = points[cut]
         table = shape_table(case, centroids[cut], mesh.spacing[cells], mesh.cells[cells], mesh.nodes)
-        np.add.at(weights, table.nodes, np.repeat(volumes[cut], np.diff(table.offsets)) * table.table[:, 0])
+        np.add.at(weights, table.nodes, np.repeat(volumes[cut], np.diff(table.offsets)) * table.entries()[0])
     d.share.ranks.sum(weights)
     return np.where(d.share.halo.owned, weights[d.share.nodes], 0.0)

@@ -29,12 +29,14 @@ class Scheme:
         points = self.active.live.size
         self.slot_of, self.node_owner = state.slot_of, state.owner
         self.W = np.zeros(self.d.nodes)
-        self.D = np.empty(points)
+        self.D, self.S2 = np.empty((2, points))
         self.point = np.zeros((points * (1 + self.d.dim), state.u.shape[1]))
         bodies = self.d.dim + rigid.rotations(self.d.dim), 1 + self.d.dim
         self.sums = np.zeros((self.particles, sum(bodies)))
         self.forces, self.moments = self.sums[:, : bodies[0]], self.sums[:, bodies[0] :]
         self.motion = np.zeros((self.particles, bodies[0]))
+        self.work = np.empty((1, self.d.shape.longest))
+        self.velocity = np.zeros((self.d.dim, state.u.shape[1]))
 
     def rates(self, u: Floats, rate: Floats) -> None:
         """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective."""
@@ -46,8 +48,8 @@ class Scheme:
         kernels.start(self.W, a.potential, a.nodes)
         self.sums[:] = 0.0
         kernels.potential(
-            self.W, self.forces, self.point, self.D, u, a.live, a.owner, d.weights, d.x,
-            table.offsets, table.nodes, table.table, m, moving,
+            self.W, self.forces, self.point, self.D, self.S2, u, a.live, a.owner, a.mask, a.present, a.several, d.weights, d.x,
+            table.offsets, table.nodes, table.rows, table.table, self.work, m, moving,
         )
         d.share.halo.add(self.W)
         self.W[a.nodes] /= d.mass[a.nodes]
@@ -64,8 +66,8 @@ class Scheme:
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
         kernels.clear(rate, a.nodes)
         kernels.divergence(
-            rate, self.point, self.D, self.W, self.motion, a.live, a.owner, d.weights, d.x,
-            table.offsets, table.nodes, table.table, m, moving, d.huang,
+            rate, self.point, self.D, self.S2, self.W, self.motion, self.velocity, a.live, a.owner, a.present, d.weights, d.x,
+            table.offsets, table.nodes, table.rows, table.table, self.work, m, moving, d.huang,
         )
         if moving:
             kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)

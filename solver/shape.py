@@ -4,7 +4,6 @@
 functions of the same mesh. Both give a `ShapeTable`, the only thing that the kernels know of the discretisation.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .jit import jit
+from .simd import LANES
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -31,24 +31,52 @@ class ShapeError(ValueError):
 
 @dataclass(frozen=True)
 class ShapeTable:
-    """Compressed rows: point p sees nodes[offsets[p] : offsets[p + 1]].
+    """Who sees whom: point p sees nodes[offsets[p] + i], i < offsets[p + 1] - offsets[p].
 
-    offsets (p + 1,), nodes (e,), table (e, 1 + dim) = (N, grad N); N without unit, grad N in 1/nm.
+    Its shape functions are table[:, rows[p] + i] = (N, grad N), grad N in 1/nm. Points that see the same pattern of nodes,
+    as nearly all of a lattice do, share their rows: the table stays in the processor's cache. Rows start at multiples of
+    LANES, and zeros fill them up, so that loops may run over whole packs.
+    offsets (p + 1,), nodes (e,), rows (p,), table (1 + dim, stored).
     """
 
     offsets: Integers
     nodes: Numbers
+    rows: Integers
     table: Floats
 
     @property
     def points(self) -> int:
         """The number of points."""
-        return self.offsets.size - 1
+        return self.rows.size
+
+    @property
+    def longest(self) -> int:
+        """Room for the longest row, in whole packs."""
+        return int(padded(np.diff(self.offsets).max(initial=0)))
+
+    def entries(self) -> Floats:
+        """(N, grad N) of every entry, in the order of `nodes`: (1 + dim, e)."""
+        counts = np.diff(self.offsets)
+        return self.table[:, np.repeat(self.rows - self.offsets[:-1], counts) + np.arange(self.nodes.size)]
 
 
 def row_offsets(counts: Integers) -> Integers:
     """The starts of rows of the given lengths, and the end of the last."""
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
+
+
+def padded(counts: Integers) -> Integers:
+    """Counts rounded up to whole packs."""
+    return LANES * -(-counts // LANES)
+
+
+def pad_rows(offsets: Integers, table: Floats) -> tuple[Integers, Floats]:
+    """Spread the rows table[:, offsets[p] : offsets[p + 1]] to multiples of LANES, zeros between; their new starts."""
+    counts = np.diff(offsets)
+    starts = row_offsets(padded(counts))
+    spread = np.zeros((len(table), int(starts[-1])))
+    spread[:, np.repeat(starts[:-1] - offsets[:-1], counts) + np.arange(table.shape[1])] = table
+    return starts[:-1], spread
 
 
 def search_range(spacing: Floats, gamma: float, tolerance: float) -> Floats:
@@ -70,7 +98,8 @@ def linear(points: Floats, cells: Numbers, nodes: Floats) -> ShapeTable:
     table[:, 1:, 0] = np.einsum("pkd,pd->pk", gradients, points - nodes[cells[:, 0]])
     table[:, 0, 0] = 1.0 - table[:, 1:, 0].sum(axis=1)
     offsets = np.arange(count + 1, dtype=np.int64) * corners
-    return ShapeTable(offsets, cells.reshape(-1).astype(np.int32), table.reshape(-1, corners))
+    rows, spread = pad_rows(offsets, table.reshape(-1, corners).T)
+    return ShapeTable(offsets, cells.reshape(-1).astype(np.int32), rows, spread)
 
 
 def lme(
@@ -87,55 +116,67 @@ def lme(
     8 times; ShapeError says which point defeats that. Source: Arroyo & Ortiz (2006), equations (24)-(33).
     """
     tree = cKDTree(nodes) if tree is None else tree
-    parts = list(_lme_chunks(points, spacing, nodes, tree, gamma, tolerance))
-    offsets = row_offsets(np.concatenate([part[0] for part in parts]))
-    return ShapeTable(offsets, np.concatenate([part[1] for part in parts]), np.concatenate([part[2] for part in parts]))
+    counts, near, keys = _neighbours(points, spacing, nodes, tree, gamma, tolerance)
+    offsets = row_offsets(counts)
+    _, first, kind = np.unique(keys, return_index=True, return_inverse=True)
+    table, residual = _solve(points[first], spacing[first], nodes, *_pick(offsets, near, first), gamma)
+    starts, table = pad_rows(row_offsets(counts[first]), table)
+    if not (failed := np.flatnonzero(~(residual[kind] <= CONVERGED))).size:
+        return ShapeTable(offsets, near, starts[kind], table)
+    rows = starts[kind]
+    lists = np.split(near, offsets[1:-1])
+    for p in failed:
+        rows[p] = table.shape[1]
+        lists[p], more = _repair(int(p), points[p], spacing[p], nodes, tree, gamma, tolerance)
+        table = np.concatenate([table, pad_rows(np.array([0, more.shape[1]]), more)[1]], axis=1)
+    return ShapeTable(row_offsets(np.array([part.size for part in lists])), np.concatenate(lists), rows, table)
 
 
-def _lme_chunks(
+def _neighbours(
     points: Floats, spacing: Floats, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
-) -> Iterator[tuple[Integers, Numbers, Floats]]:
-    for first in range(0, max(len(points), 1), CHUNK):
+) -> tuple[Integers, Numbers, NDArray[np.uint64]]:
+    """Numbers of neighbours, the neighbours, and a key for each point's pattern; see `arrange`."""
+    counts, near, keys = [], [], np.empty(len(points), dtype=np.uint64)
+    for first in range(0, len(points), CHUNK):
         part = slice(first, first + CHUNK)
-        counts, near, table, residual = _solve(points[part], spacing[part], nodes, tree, gamma, tolerance)
-        failed = np.flatnonzero(~(residual <= CONVERGED))
-        if failed.size:
-            rows = np.split(np.arange(near.size), np.cumsum(counts)[:-1])
-            nears, tables = [near[row] for row in rows], [table[row] for row in rows]
-            for p in failed:
-                nears[p], tables[p] = _repair(
-                    first + p, points[first + p], spacing[first + p], nodes, tree, gamma, tolerance
-                )
-            counts = np.array([row.size for row in nears], dtype=np.int64)
-            near, table = np.concatenate(nears), np.concatenate(tables)
-        yield counts, near, table
+        lists = tree.query_ball_point(points[part], search_range(spacing[part], gamma, tolerance))
+        counts.append(np.fromiter(map(len, lists), np.int64, len(lists)))
+        near.append(np.fromiter(chain.from_iterable(lists), np.int32, int(counts[-1].sum())))
+        arrange(near[-1], keys[part], points[part], spacing[part], nodes, row_offsets(counts[-1]))
+    if not near:
+        return np.empty(0, np.int64), np.empty(0, np.int32), keys
+    return np.concatenate(counts), np.concatenate(near), keys
+
+
+def _pick(offsets: Integers, near: Numbers, chosen: Integers) -> tuple[Integers, Numbers]:
+    """Offsets and neighbours of the chosen points alone."""
+    counts = np.diff(offsets)[chosen]
+    picked = row_offsets(counts)
+    return picked, near[np.repeat(offsets[chosen] - picked[:-1], counts) + np.arange(picked[-1])]
 
 
 def _solve(
-    points: Floats, spacing: Floats, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
-) -> tuple[Integers, Numbers, Floats, Floats]:
-    """Neighbour counts, neighbours, table and Newton residuals |r| / h of some points."""
-    lists = tree.query_ball_point(points, search_range(spacing, gamma, tolerance))
-    counts = np.fromiter(map(len, lists), np.int64, len(lists))
-    near = np.fromiter(chain.from_iterable(lists), np.int32, int(counts.sum()))
-    offsets = row_offsets(counts)
-    table = np.empty((near.size, 1 + nodes.shape[1]))
-    residual = np.empty(counts.size)
+    points: Floats, spacing: Floats, nodes: Floats, offsets: Integers, near: Numbers, gamma: float
+) -> tuple[Floats, Floats]:
+    """Table and Newton residuals |r| / h of some points."""
+    table = np.empty((1 + nodes.shape[1], near.size))
+    residual = np.empty(len(points))
     solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma)
-    return counts, near, table, residual
+    return table, residual
 
 
 def _repair(
     p: int, point: Floats, spacing: float, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
 ) -> tuple[Numbers, Floats]:
-    """The table row of a point that needs a wider range, or ShapeError."""
-    h = spacing
+    """Neighbours and table rows of a point that needs a wider range, or ShapeError."""
+    h = np.array([spacing])
     for _ in range(ATTEMPTS):
         h *= WIDER
-        _, near, table, residual = _solve(point[None], np.array([h]), nodes, tree, gamma, tolerance)
+        counts, near, _ = _neighbours(point[None], h, nodes, tree, gamma, tolerance)
+        table, residual = _solve(point[None], h, nodes, row_offsets(counts), near, gamma)
         if residual[0] <= CONVERGED:
             return near, table
-    r = float(search_range(np.array([h]), gamma, tolerance)[0])
+    r = float(search_range(h, gamma, tolerance)[0])
     raise ShapeError(
         f"Newton stopped at |r| = {residual[0]:.1e} h at point {p} ({', '.join(f'{x:.6g}' for x in point)}) nm with "
         f"gamma = {gamma:g}: {near.size} nodes within {r:.3g} nm do not surround it"
@@ -143,8 +184,47 @@ def _repair(
 
 
 @jit
+def arrange(near, keys, points, spacing, nodes, offsets):
+    """Order each point's neighbours by their displacement in units of h, and give equal patterns equal keys.
+
+    Displacements count as equal within 2^-30 h. Both order and key come from a hash: only equality matters.
+    """
+    dim = points.shape[1]
+    most = 0
+    for p in range(keys.size):
+        most = max(most, offsets[p + 1] - offsets[p])
+    code = np.empty(most, dtype=np.uint64)
+    sorted_near = np.empty(most, dtype=near.dtype)
+    for p in range(keys.size):
+        first = offsets[p]
+        count = offsets[p + 1] - first
+        for i in range(count):
+            h = np.uint64(1469598103934665603)
+            for k in range(dim):
+                units = np.rint((nodes[near[first + i], k] - points[p, k]) / spacing[p] * 2.0**30)
+                h = mix(h, np.uint64(np.int64(units)))
+            code[i] = h
+        order = np.argsort(code[:count])
+        key = mix(np.uint64(count), np.uint64(np.int64(np.rint(spacing[p] * 2.0**30))))
+        for i in range(count):
+            key = mix(key, code[order[i]])
+            sorted_near[i] = near[first + order[i]]
+        keys[p] = key
+        for i in range(count):
+            near[first + i] = sorted_near[i]
+
+
+@jit
+def mix(h, value):
+    """A 64-bit hash of h and value, by multiplication and shifts."""
+    h = (h ^ value) * np.uint64(0x9E3779B97F4A7C15)
+    h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
+    return h ^ (h >> np.uint64(32))
+
+
+@jit
 def solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma):
-    """Fill table (e, 1 + dim) and residual (p,) = |sum N (x - x_a)| / h; infinity where Newton did not converge.
+    """Fill table (1 + dim, e) and residual (p,) = |sum N (x - x_a)| / h; infinity where Newton did not converge.
 
     Newton on the convex log Z(lambda), with step halving where log Z would grow, in units of h.
     """
@@ -201,12 +281,12 @@ def solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma):
             continue
         residual[p] = size
         for i in range(count):
-            table[first + i, 0] = weight[i]
+            table[0, first + i] = weight[i]
             for k in range(dim):
                 g = 0.0
                 for q in range(dim):
                     g += inverse[k, q] * d[i, q]
-                table[first + i, 1 + k] = -weight[i] * g / h
+                table[1 + k, first + i] = -weight[i] * g / h
 
 
 @jit

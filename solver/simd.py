@@ -1,19 +1,25 @@
 """Packs of eight doubles for numba: a node's fields side by side in one vector register.
 
 numba has no vector type, and its optimiser does not find the one that frit's layout is made for: rho and seven order
-parameters of a node are eight neighbouring doubles. `Pack` maps to LLVM's `<8 x double>`: one AVX-512 register, or two
-AVX2 registers on older processors. Only four operations exist, all usable inside `@jit` functions alone.
+parameters of a node are eight neighbouring doubles. A pack maps to LLVM's `<8 x double>`: one AVX-512 register, or two
+AVX2 registers on older processors. Inside `@jit` functions `load`, `store` and `splat` move packs, + - * work on them
+and with floats, so that a formula written for a float also serves a pack, and `total`, `first`, `with_first` and `positive`
+do what their names say.
 """
 
+import operator
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, register_model
+from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 8
-VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+DOUBLE = ir.DoubleType()
+VECTOR = ir.VectorType(DOUBLE, LANES)
+FAST = ("contract", "reassoc", "nsz")
 
 
 class PackType(types.Type):
@@ -28,15 +34,21 @@ pack = PackType()
 
 @register_model(PackType)
 class PackModel(models.PrimitiveModel):  # type: ignore[misc]
+    """A pack is an LLVM vector."""
+
     def __init__(self, manager: Any, frit_type: PackType) -> None:
         super().__init__(manager, frit_type, VECTOR)
 
 
+def _index(lane: int) -> Any:
+    return ir.Constant(ir.IntType(32), lane)
+
+
 def _broadcast(builder: Any, scalar: Any) -> Any:
     nothing = ir.Constant(VECTOR, ir.Undefined)
-    first = builder.insert_element(nothing, scalar, ir.Constant(ir.IntType(32), 0))
+    one = builder.insert_element(nothing, scalar, _index(0))
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return builder.shuffle_vector(first, nothing, zeros)
+    return builder.shuffle_vector(one, nothing, zeros)
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, column: Any) -> Any:
@@ -82,11 +94,82 @@ def splat(typing: Any, scalar: Any) -> Any:
 
 
 @intrinsic
-def fma(typing: Any, factor: Any, multiplied: Any, added: Any) -> Any:
-    """fma(a, x, y): the pack a x + y for a scalar a."""
+def first(typing: Any, value: Any) -> Any:
+    """first(pack): lane 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        product = builder.fmul(_broadcast(builder, arguments[0]), arguments[1], flags=("contract",))
-        return builder.fadd(product, arguments[2], flags=("contract",))
+        return builder.extract_element(arguments[0], _index(0))
 
-    return pack(types.float64, pack, pack), generate
+    return types.float64(pack), generate
+
+
+@intrinsic
+def with_first(typing: Any, value: Any, scalar: Any) -> Any:
+    """with_first(pack, x): the pack with x in lane 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.insert_element(arguments[0], arguments[1], _index(0))
+
+    return pack(pack, types.float64), generate
+
+
+@intrinsic
+def total(typing: Any, value: Any) -> Any:
+    """total(pack): the sum of the lanes, by halves."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value, lanes = arguments[0], LANES
+        while lanes > 1:
+            lanes //= 2
+            nothing = ir.Constant(value.type, ir.Undefined)
+            chosen = ir.VectorType(ir.IntType(32), lanes)
+            low = builder.shuffle_vector(value, nothing, ir.Constant(chosen, list(range(lanes))))
+            high = builder.shuffle_vector(value, nothing, ir.Constant(chosen, list(range(lanes, 2 * lanes))))
+            value = builder.fadd(low, high, flags=FAST)
+        return builder.extract_element(value, _index(0))
+
+    return types.float64(pack), generate
+
+
+@intrinsic
+def positive(typing: Any, value: Any) -> Any:
+    """positive(pack): max(x, 0) in every lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        zero = ir.Constant(VECTOR, [0.0] * LANES)
+        return builder.select(builder.fcmp_ordered(">", arguments[0], zero), arguments[0], zero)
+
+    return pack(pack), generate
+
+
+def _lanewise(instruction: str) -> Any:
+    """The intrinsic that applies an LLVM instruction to two packs."""
+
+    @intrinsic
+    def apply(typing: Any, a: Any, b: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return getattr(builder, instruction)(*arguments, flags=FAST)
+
+        return pack(pack, pack), generate
+
+    return apply
+
+
+def _overload(symbol: Callable[[Any, Any], Any], instruction: str) -> None:
+    """Teach numba an operator for packs, and for packs with floats."""
+    apply = _lanewise(instruction)
+
+    @overload(symbol)
+    def choose(a, b):  # type: ignore[no-untyped-def]  # numba compares the names and annotations
+        if isinstance(a, PackType) and isinstance(b, PackType):
+            return lambda a, b: apply(a, b)
+        if isinstance(a, PackType) and isinstance(b, types.Float):
+            return lambda a, b: apply(a, splat(b))
+        if isinstance(a, types.Float) and isinstance(b, PackType):
+            return lambda a, b: apply(splat(a), b)
+        return None
+
+
+_overload(operator.add, "fadd")
+_overload(operator.sub, "fsub")
+_overload(operator.mul, "fmul")

@@ -66,7 +66,7 @@ def _lowest_free(slot_of: Numbers, neighbours: list[int]) -> int:
 def repack(u: Floats, owner: Numbers, slot_of: Numbers, columns: int) -> tuple[Floats, Numbers]:
     """Fields and owners with every particle's values moved to its slot; `columns` is the new F."""
     new_u = np.zeros((len(u), columns))
-    new_owner = np.full((len(u), columns - 1), -1, dtype=np.int32)
+    new_owner = np.full((len(u), int(slot_of.max()) + 1), -1, dtype=np.int32)
     move(new_u, new_owner, u, owner, slot_of)
     return new_u, new_owner
 

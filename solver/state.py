@@ -21,7 +21,7 @@ class State:
     """Everything that a run goes on from.
 
     u (n, F): rho in column 0, slot s of eta in column 1 + s, unused columns 0; F is a multiple of LANES.
-    owner (n, F - 1): the particle that slot s means at this node, -1 where the slot is empty.
+    owner (n, slots): the particle that slot s means at this node, -1 where the slot is empty.
     slot_of (particles,): the slot of each particle, the same on all ranks.
     """
 
@@ -39,8 +39,8 @@ class State:
 
     @property
     def eta(self) -> Floats:
-        """Slots of the order parameters at the nodes (n, F - 1)."""
-        return self.u[:, 1:]
+        """Slots of the order parameters at the nodes (n, slots)."""
+        return self.u[:, 1 : 1 + self.owner.shape[1]]
 
 
 def width(slots: int) -> int:
@@ -82,8 +82,9 @@ def initial_state(case: Case, nodes: Floats, ring: float) -> State:
     cut = case.activation.eps_eta
     extent = radii + 0.5 * xi * np.log(1.0 / cut)
     slot_of = colour(_neighbours(centres, extent + ring), len(radii)) if few else np.arange(len(radii), dtype=np.int32)
-    u = np.zeros((len(nodes), width(int(slot_of.max()) + 1)))
-    owner = np.full((len(nodes), u.shape[1] - 1), -1, dtype=np.int32)
+    slots = int(slot_of.max()) + 1
+    u = np.zeros((len(nodes), width(slots)))
+    owner = np.full((len(nodes), slots), -1, dtype=np.int32)
     tree = cKDTree(nodes)
     for a, centre in enumerate(centres):
         near = np.asarray(tree.query_ball_point(centre, radii[a] + 0.5 * xi * np.log(1.0 / TAIL)), dtype=np.int64)

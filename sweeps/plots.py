@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import zarr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -54,7 +55,7 @@ def read_history(directory: Path) -> dict[str, NDArray[Any]]:
 def _row(line: bytes, where: str) -> dict[str, Any]:
     try:
         return dict(json.loads(line))
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 
 
@@ -75,7 +76,7 @@ def plot_history(directory: Path, out: Path) -> None:
         ax.set_ylabel(label)
         ax.grid(alpha=0.25, lw=0.5)
         ax.margins(x=0.01)
-    axes[0].set_title(case["name"])
+    axes[0].set_title(case["name"], parse_math=False)
     axes[-1].set_xlabel("time (model units)")
     figure.align_ylabels(list(axes))
     _save(figure, out)
@@ -118,7 +119,7 @@ def read_snapshot(directory: Path, time: float) -> Snapshot:
 
 
 def plot_snapshot(directory: Path, time: float, out: Path) -> float:
-    """Draw the snapshot nearest to `time`, in 3-D its three mid-planes. Returns its time."""
+    """Draw the snapshot nearest to `time`, in 3-D its three mid-planes; returns its time."""
     case, snapshot = _read_case(directory), read_snapshot(directory, time)
     size = np.asarray(case["domain"]["size"], float)
     colours = particle_colours(snapshot.nodes, snapshot.first_owner, int(snapshot.owner.max(initial=0)))
@@ -133,9 +134,9 @@ def plot_snapshot(directory: Path, time: float, out: Path) -> float:
             _draw_box(ax, np.asarray(box, float), plane)
     title = f"{case['name']}, t = {snapshot.time:g}"
     if len(planes) == 1:
-        axes[0].set_title(title)
+        axes[0].set_title(title, parse_math=False)
     else:
-        figure.suptitle(title, fontsize=9.5)
+        figure.suptitle(title, fontsize=9.5, parse_math=False)
     _save(figure, out)
     return snapshot.time
 
@@ -163,57 +164,63 @@ def particle_colours(nodes: Floats, owner: Ints, last: int = 0) -> Floats:
     return palette[[*chosen, len(PALETTE)]]
 
 
-def interpolate(nodes: Floats, fields: Floats, at: Floats) -> Floats:
-    """Fields (n, f) of scattered nodes at points (p, dim), by moving least squares: exact where they are linear.
+def interpolation(tree: "cKDTree", at: Floats) -> tuple[Ints, Floats]:
+    """Nodes (p, k) near points (p, dim), and weights by moving least squares: exact for linear fields.
 
     weight_a = w_a P_a . M^-1 (1, 0..), M = sum w P P^T, P = (1, x_a - x), w = (1 - d^2 / reach^2)^2
     """
-    from scipy.spatial import cKDTree
-
-    tree, count = cKDTree(nodes), min(NEIGHBOURS[nodes.shape[1]], len(nodes) - 1)
-    values = np.empty((len(at), fields.shape[1]))
-    for part in np.array_split(np.arange(len(at)), len(at) // 50_000 + 1):
-        found = tree.query(at[part], count + 1)
-        distance, near = np.asarray(found[0])[..., None], np.asarray(found[1])[:, :-1]
-        reach = distance[:, -1:]
-        P = np.concatenate([np.ones((*near.shape, 1)), (nodes[near] - at[part, None]) / reach], axis=-1)
-        w = (1 - (distance[:, :-1] / reach) ** 2) ** 2
-        M = (w * P).swapaxes(1, 2) @ P + 1e-9 * np.eye(P.shape[-1])
-        first = np.linalg.solve(M, np.eye(P.shape[-1])[:, :1])
-        values[part] = np.einsum("pa,paf->pf", (w * (P @ first))[..., 0], fields[near])
-    return values
+    found = tree.query(at, min(NEIGHBOURS[tree.m] + 1, tree.n))
+    distance, near = np.asarray(found[0])[..., None], np.asarray(found[1])[:, :-1]
+    reach = distance[:, -1:]
+    P = np.concatenate([np.ones((*near.shape, 1)), (tree.data[near] - at[:, None]) / reach], axis=-1)
+    w = (1 - (distance[:, :-1] / reach) ** 2) ** 2
+    M = (w * P).swapaxes(1, 2) @ P + 1e-9 * np.eye(P.shape[-1])
+    return near, (w * (P @ np.linalg.solve(M, np.eye(P.shape[-1])[:, :1])))[..., 0]
 
 
 def section(
     snapshot: Snapshot, colours: Floats, size: Floats, plane: tuple[int, int]
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """x, y, rho (ny, nx) and picture (ny, nx, 3) of a plane, in 3-D of one through the middle."""
-    i, j = plane
+    from scipy.spatial import cKDTree
+
     pitch = size.max() / PIXELS[len(size)]
     x, y = (np.linspace(0, size[k], round(size[k] / pitch)) for k in plane)
     at = np.tile(size / 2, (len(x) * len(y), 1))
-    at[:, i], at[:, j] = (grid.ravel() for grid in np.meshgrid(x, y))
-    nodes, near = snapshot.nodes, np.full(len(snapshot.nodes), True)
-    for k in set(range(len(size))) - {i, j}:
-        near &= abs(nodes[:, k] - size[k] / 2) < 4 * (np.prod(size) / len(nodes)) ** (1 / len(size))
-    rho, eta_squared, owner = snapshot.rho[near], snapshot.eta_squared[near], snapshot.owner[near]
-    tint = np.where(owner >= 0, np.maximum(rho, 1e-6), 1e-9)[:, None]
-    fields = np.column_stack([rho, eta_squared, tint, tint * colours[owner]])
-    values = interpolate(nodes[near], fields, at).reshape(len(y), len(x), -1)
-    return x, y, values[..., 0], _shade(values)
+    at[:, plane] = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    close = np.full(len(snapshot.nodes), True)
+    for k in set(range(len(size))) - set(plane):
+        spacing = (np.prod(size) / len(close)) ** (1 / len(size))
+        close &= abs(snapshot.nodes[:, k] - size[k] / 2) < 4 * spacing
+    tree = cKDTree(snapshot.nodes[close])
+    density, order, owner = snapshot.rho[close], snapshot.eta_squared[close], snapshot.owner[close]
+    rho, picture = np.empty(len(at)), np.empty((len(at), 3))
+    for part in np.array_split(np.arange(len(at)), len(at) // 20_000 + 1):
+        near, weight = interpolation(tree, at[part])
+        rho[part], picture[part] = _shade(weight, density[near], order[near], owner[near], colours)
+    return x, y, rho.reshape(len(y), len(x)), picture.reshape(len(y), len(x), 3)
 
 
-def _shade(values: Floats) -> Floats:
-    """Particles in colour, grain boundaries dark, vacancy white; `values`: rho, sum eta^2, tint, tint x colour.
+def _shade(
+    weight: Floats, rho: Floats, eta_squared: Floats, owner: Ints, colours: Floats
+) -> tuple[Floats, Floats]:
+    """rho (p,) and colour (p, 3) of pixels from their nodes (p, k): vacancy white, grain boundaries dark.
 
-    eta^2 / rho^2 is 1 in a grain, on to its surface, and 1/2 where two grains meet.
+    Where two grains meet eta_a + eta_b = rho: the owner leads by eta_a - eta_b = sqrt(2 sum eta^2 - rho^2).
+    Interpolated with the sign of its owner, the lead is smooth across a boundary: its zero is the dark line.
     """
-    rho, eta_squared, tint = (values[..., k : k + 1] for k in range(3))
-    solid = (2 * rho - 0.5).clip(0, 1)
-    dark = (2 - 2 * eta_squared / np.maximum(rho, 0.3) ** 2).clip(0, 1) ** 2
-    colour = (values[..., 3:] / np.maximum(tint, 1e-9)).clip(0, 1)
-    picture: Floats = 1 + solid * (colour + dark * (BOUNDARY - colour) - 1)
-    return picture
+    owned = owner >= 0
+    lead = np.sqrt((2 * eta_squared - rho**2).clip(0, rho.clip(0) ** 2))
+    alike = (owner[:, :, None] == owner[:, None]) & owned[:, None]
+    share = (alike @ (weight * lead)[..., None])[..., 0]
+    first = np.take_along_axis(owner, share.argmax(axis=1)[:, None], axis=1)
+    ahead = share.max(axis=1) - np.where(owner == first, 0.0, share).max(axis=1)
+    here = (weight * rho).sum(axis=1)
+    behind = ((weight * rho * owned).sum(axis=1) - ahead) / here.clip(0.5)
+    dark = (1 - (1 - behind).clip(0, 1) ** 2) ** 2
+    solid = (4 * here - 1.5).clip(0, 1)
+    colour = colours[first[:, 0]]
+    return here, 1 + solid[:, None] * (colour + dark[:, None] * (BOUNDARY - colour) - 1)
 
 
 def _draw_section(
@@ -232,10 +239,8 @@ def _draw_section(
 def _draw_box(ax: "Axes", box: Floats, plane: tuple[int, int]) -> None:
     from matplotlib.patches import Rectangle
 
-    (low, high), axes = box, list(plane)
-    ax.add_patch(
-        Rectangle(tuple(low[axes]), *(high - low)[axes], fill=False, ec="#444444", lw=0.8, ls=(0, (4, 3)))
-    )
+    (x, y), (width, height) = box[0, list(plane)], (box[1] - box[0])[list(plane)]
+    ax.add_patch(Rectangle((x, y), width, height, fill=False, ec="#444444", lw=0.8, ls=(0, (4, 3))))
 
 
 def _figure(width: float, height: float) -> "Figure":

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Self
 
 ENDS = ("done", "failed", "interrupted", "refused")
-# An outer MPI or Slurm step, which the ranks would join (PMI covers PMIX); and what makes Python write a printed
-# line in two parts, between which another rank's gets.
+# An outer MPI or Slurm step, which the ranks would join (PMI covers PMIX), and what makes Python write
+# a printed line in two parts, between which another rank's may get.
 SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL", "PYTHONUNBUFFERED")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM")
@@ -176,7 +176,7 @@ class Launch:
         return Outcome("failed", f"mpirun ended with status {code} and no word of the solver", code, spoken)
 
     def _reap(self) -> None:
-        """mpirun's end is the end of all: no orphan stays, and the directory is free when wait() returns."""
+        """mpirun's end is the end of all: no orphan stays."""
         self._process.wait()
         for _ in range(100):
             if not self.kill():

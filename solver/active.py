@@ -33,6 +33,7 @@ class Active:
     several: NDArray[np.bool_]  # (L,) points that see more than one particle
     nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
     owned: Integers  # those of them that this rank owns
+    pairs: Integers  # (pairs, 2) particles a < b that a live point of any rank sees together
     potential: Floats  # (n,) what this rank's still points owe to W, times m_a
     edge_nodes: Integers  # nodes between live points and a particle's still interior
     edge_particle: Numbers  # that particle
@@ -54,7 +55,6 @@ def activate(d: Discretisation, state: State) -> Active:
     switch = d.case.activation
     if switch.few_order_parameters:
         _drop_small(state, switch.eps_eta)
-        _compact(d, state)
     flags, owner = _settle(d, state)
     table = d.shape
     low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
@@ -84,6 +84,7 @@ def activate(d: Discretisation, state: State) -> Active:
         several=mask.sum(axis=1) > 2.0,
         nodes=np.flatnonzero(moving),
         owned=d.share.owned[moving[d.share.owned]],
+        pairs=_everyones_pairs(d, slots.meeting(owner, live)),
         potential=potential,
         edge_nodes=edge_nodes,
         edge_particle=high[edge_nodes].astype(np.int32),
@@ -102,43 +103,51 @@ def _drop_small(state: State, eps: float) -> None:
     state.owner[small] = -1
 
 
-def _compact(d: Discretisation, state: State) -> None:
-    """Give back packs of slots that the thinner tails of the particles no longer need."""
-    if state.u.shape[1] == LANES:
-        return
-    _, owner, _ = _sense(d, state)
-    pairs = _everyones_pairs(d, slots.meeting(owner, np.arange(len(owner))))
-    slot_of = slots.colour(pairs, len(state.slot_of))
-    columns = width(int(slot_of.max()) + 1)
-    if columns < state.u.shape[1]:
-        state.slot_of = slot_of
-        state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
-
-
 def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
-    """Flags and slot owners of the points; slots are moved until no point and no claimed node sees two particles in one."""
+    """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks.
+
+    Particles that clash move to other slots until none does. What has been seen to meet stays known, so this ends. Where
+    the particles then need fewer packs of slots than there are, all are dealt out anew.
+    """
+    known = np.empty((0, 2), dtype=np.int64)
+    compact = True
     while True:
         flags, owner, clash = _sense(d, state)
         if not d.case.activation.enabled:
             flags[:] = 1
         if not d.case.activation.few_order_parameters:
+            owner[:] = np.arange(owner.shape[1], dtype=np.int32)
             return flags, owner
-        marked = np.flatnonzero(flags)
-        claims = state.owner.copy()
-        crowded = np.empty((marked.size, 2), dtype=np.int64)
-        kernels.claim(claims, crowded, marked, owner[marked], d.shape.offsets, d.shape.nodes)
-        mine = claims.copy()
-        d.share.halo.most(claims)
-        torn = (mine >= 0) & (mine != claims)
-        found = [clash[marked], crowded, np.stack([mine[torn], claims[torn]], axis=1)]
-        clashes = _everyones_pairs(d, np.concatenate(found))
-        if not len(clashes):
+        claims, clashes = _claim(d, state, flags, owner, clash)
+        met = slots.meeting(claims, np.arange(d.nodes))
+        known = _everyones_pairs(d, np.concatenate([known, met, clashes]))
+        clashes = _everyones_pairs(d, clashes)
+        slot_of = state.slot_of
+        if len(clashes):
+            slot_of = slots.recolour(slot_of, known)
+        elif compact and state.u.shape[1] > LANES:
+            slot_of = slots.colour(known, len(slot_of))
+            compact = False
+        columns = width(int(slot_of.max()) + 1)
+        if not len(clashes) and columns >= state.u.shape[1]:
             state.owner = claims
             return flags, owner
-        meetings = _everyones_pairs(d, slots.meeting(owner, marked))
-        state.slot_of = slots.recolour(state.slot_of, slots.unique_pairs(np.concatenate([meetings, clashes])))
-        columns = max(width(int(state.slot_of.max()) + 1), state.u.shape[1])
-        state.u, state.owner = slots.repack(state.u, state.owner, state.slot_of, columns)
+        state.slot_of = slot_of
+        state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
+
+
+def _claim(
+    d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers
+) -> tuple[Numbers, Integers]:
+    """The owners of the nodes' slots with one ring of room, and the pairs of particles that want the same slot."""
+    marked = np.flatnonzero(flags)
+    claims = state.owner.copy()
+    crowded = np.empty((marked.size, 2), dtype=np.int64)
+    kernels.claim(claims, crowded, marked, owner[marked], d.shape.offsets, d.shape.nodes)
+    mine = claims.copy()
+    d.share.halo.most(claims)
+    torn = (mine >= 0) & (mine != claims)
+    return claims, np.concatenate([clash[marked], crowded, np.stack([mine[torn], claims[torn]], axis=1)])
 
 
 def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]:

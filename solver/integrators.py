@@ -43,6 +43,13 @@ def paper_step(shortest: float, case: Case) -> float:
     return 0.1 * shortest**2 / (2.0 * case.model.L * case.model.kappa_eta)
 
 
+def contact_time(shortest: float, case: Case) -> float:
+    """tau = 2 dt (tolerance / 10^-3) with the paper's dt: at the default tolerance contacts are then about as stiff as the
+    diffusion on the same nodes, and the lag that tau brings falls with the tolerance."""
+    tolerance = case.time.tolerance
+    return 2.0 * paper_step(shortest, case) * (1.0 if tolerance is None else tolerance / 1e-3)
+
+
 class RK2:
     """Two half Euler steps (32): u' = u + dt/2 F(u), then u' + dt/2 F(u'). First order, stable for dt |lambda| < 4."""
 
@@ -85,6 +92,7 @@ GROWTH = 5.0  # largest factor between two steps
 SHRINK = 0.1
 MOST_STAGES = 200
 ESTIMATE_EVERY = 25  # accepted steps between two estimates of the spectral radius
+RELAX_EVERY = 5  # accepted steps for which the contacts' stiffness is kept
 MARGIN = 1.2  # factor on an estimate of the spectral radius
 
 
@@ -98,8 +106,9 @@ class Chebyshev:
 
     stops_at_events = False
 
-    def __init__(self, tolerance: float, memory: dict[str, float] | None = None) -> None:
-        self.tolerance = tolerance
+    def __init__(self, tolerance: float, tau: float, memory: dict[str, float] | None = None) -> None:
+        """tau: time in which contacts may relax at the fastest, see `Scheme.relax_contacts`."""
+        self.tolerance, self.tau = tolerance, tau
         kept = memory or {}
         self.dt = kept.get("dt", 0.0)
         self.radius = kept.get("radius", 0.0)
@@ -132,6 +141,9 @@ class Chebyshev:
         """Try steps until one is accepted."""
         nodes = scheme.active.nodes
         kernels.start(self.old, state.u, nodes)
+        if not self.fresh or self.age % RELAX_EVERY == 0:
+            scheme.relax_contacts(state.u, self.tau)
+            self.fresh = False
         if self.fresh:
             self.rate_0, self.rate_1 = self.rate_1, self.rate_0
         else:

@@ -186,6 +186,65 @@ def potential(
             add_contact(force, point, row, l, owner, weights[p], x[p], m)
 
 
+@jit
+def contact_stiffness(stiffness, keys, point, live, owner, several, weights, x, particles, m, huang):
+    """How the contact forces answer to rigid motion: stiffness[pair] += w_p k e_p (d_a, d_b) over touching points.
+
+    Moving particle c with (v, omega) changes rho at x by -(v, omega) . d_c, d_c = (grad q, x cross grad q) with
+    q = rho eta_c^2 [`wang`: rho eta_c]; the force on a is k (rho - rho_0) e, e = (g, x cross g), g = grad eta_a - grad eta_b.
+    stiffness (pairs, 2, dim + rotations, dim + rotations); keys (pairs,) sorted a particles + b with a < b. Expects the
+    fields that `potential` left in `point`.
+    """
+    dim = x.shape[1]
+    size = stiffness.shape[2]
+    direction = np.zeros(6)
+    answer = np.zeros((2, 6))
+    for l in range(live.size):
+        if not several[l]:
+            continue
+        row = l * (1 + dim)
+        p = live[l]
+        for s in range(owner.shape[1]):
+            for t in range(owner.shape[1]):
+                a = owner[l, s]
+                b = owner[l, t]
+                if a < 0 or b <= a or point[row, 1 + s] * point[row, 1 + t] <= m.c or point[row, 1 + s] <= 0.0:
+                    continue
+                for k in range(dim):
+                    direction[k] = point[row + 1 + k, 1 + s] - point[row + 1 + k, 1 + t]
+                    answer[0, k] = carried_slope(point, row, 1 + s, k, huang)
+                    answer[1, k] = carried_slope(point, row, 1 + t, k, huang)
+                turn(direction, x[p])
+                turn(answer[0], x[p])
+                turn(answer[1], x[p])
+                pair = np.searchsorted(keys, a * particles + b)
+                for c in range(2):
+                    for i in range(size):
+                        for j in range(size):
+                            stiffness[pair, c, i, j] += weights[p] * m.k * direction[i] * answer[c, j]
+
+
+@jit
+def carried_slope(point, row, column, k, huang):
+    """Component k of grad(rho eta^2) [`wang`: grad(rho eta)] at a point."""
+    rho = point[row, 0]
+    eta = point[row, column]
+    if huang:
+        return eta * eta * point[row + 1 + k, 0] + 2.0 * rho * eta * point[row + 1 + k, column]
+    return eta * point[row + 1 + k, 0] + rho * point[row + 1 + k, column]
+
+
+@jit
+def turn(vector, x):
+    """Append x cross v to v: one number in the plane, three in space."""
+    if x.shape[0] == 2:
+        vector[2] = x[0] * vector[1] - x[1] * vector[0]
+        return
+    vector[3] = x[1] * vector[2] - x[2] * vector[1]
+    vector[4] = x[2] * vector[0] - x[0] * vector[2]
+    vector[5] = x[0] * vector[1] - x[1] * vector[0]
+
+
 @inlined
 def rigid_velocity(motion, a, x, k, dim):
     """Component k of V_a(x) = v_a + omega_a cross x; motion[a] = (v_a, omega_a), v_a taken at the origin of x."""
@@ -281,31 +340,37 @@ def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, no
     """Mark the points where something happens and name the particles that their slots mean (section 2.4).
 
     flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s] is the particle found in slot s
-    of the point's nodes; where two different ones share a slot of a marked point, clash[p] = (one, other).
+    of the point's nodes, if its eta or |grad eta| is at least eps_eta here; where there are two, clash[p] = (one, other).
     """
     point = np.empty((1 + dim, u.shape[1]))
-    slots = node_owner.shape[1]
     for p in range(flags.size):
         for column in range(0, u.shape[1], LANES):
             gather(point, u, 0, offsets[p], offsets[p + 1] - offsets[p], rows[p], nodes, table, column)
-        flags[p] = 0
-        for c in range(1 + slots):
-            square = 0.0
-            for k in range(dim):
-                square += point[1 + k, c] ** 2
-            limit = eps_rho if c == 0 else eps_eta
-            if square >= limit * limit:
-                flags[p] = 1
+        flags[p] = steep(point, 0, eps_rho)
         clash[p, 0] = -1
-        for s in range(slots):
-            found = -1
+        for s in range(node_owner.shape[1]):
+            owner[p, s] = -1
+            slope = steep(point, 1 + s, eps_eta)
+            if not slope and abs(point[0, 1 + s]) < eps_eta:
+                continue
+            if slope:
+                flags[p] = 1
             for e in range(offsets[p], offsets[p + 1]):
                 a = node_owner[nodes[e], s]
-                if a >= 0 and found >= 0 and a != found:
-                    clash[p, 0] = min(a, found)
-                    clash[p, 1] = max(a, found)
-                found = max(found, a)
-            owner[p, s] = found
+                b = owner[p, s]
+                if a >= 0 and b >= 0 and a != b:
+                    clash[p, 0] = min(a, b)
+                    clash[p, 1] = max(a, b)
+                owner[p, s] = max(a, b)
+
+
+@jit
+def steep(point, column, eps):
+    """Whether the gradient of a field at a point is at least eps."""
+    square = 0.0
+    for k in range(1, point.shape[0]):
+        square += point[k, column] ** 2
+    return square >= eps * eps
 
 
 @jit

@@ -124,7 +124,7 @@ class Snapshots:
 
 def owners(u: Floats, state: State) -> tuple[NDArray[np.int32], Floats]:
     """For each node: the particle with the largest eta where rho >= 1/2, else -1; and sum eta^2."""
-    eta = u[:, 1:]
+    eta = u[:, 1 : 1 + state.owner.shape[1]]
     slot = eta.argmax(axis=1)
     particle = np.take_along_axis(state.owner, slot[:, None], axis=1)[:, 0]
     return np.where(u[:, 0] >= 0.5, particle, -1).astype(np.int32), (eta**2).sum(axis=1)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from .case import Case
 from .discretisation import activity, discretise, ring
 from .geometry import Mesh, make_mesh
-from .integrators import RK2, Chebyshev, Integrator, paper_step
+from .integrators import RK2, Chebyshev, Integrator, contact_time, paper_step
 from .partition import Ranks
 from .scheme import Scheme
 from .state import State, initial_state
@@ -38,7 +38,7 @@ def prepare(case: Case, mesh: Mesh, ranks: Ranks, whole: State | None = None) ->
 def make_integrator(case: Case, mesh: Mesh, memory: dict[str, float] | None = None) -> Integrator:
     """The integrator that the case asks for; memory: what a checkpoint kept of it."""
     if case.time.integrator == "adaptive":
-        return Chebyshev(case.time.tolerance, memory)
+        return Chebyshev(case.time.tolerance, contact_time(shortest_distance(case, mesh), case), memory)
     return RK2(case.time.step or paper_step(shortest_distance(case, mesh), case))
 
 

@@ -1,7 +1,15 @@
-"""Rigid-body motion: from contact forces and particle moments to velocities   (6)-(11)."""
+"""Rigid-body motion: from contact forces and particle moments to velocities   (6)-(11).
+
+Contacts are by far the stiffest part of the model, and the least interesting: within a few hundredths of a time unit the
+particles sit where their forces vanish, and then follow diffusion. `relaxation` keeps that motion and bounds its speed.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, eye_array
+from scipy.sparse.linalg import splu
 
 from .energy import Coefficients
 
@@ -42,3 +50,28 @@ def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
     F = forces[:, :dim]
     omega = m.m_r * (forces[:, dim:] - torque(centre, F)) / volume
     return np.hstack([m.m_t * F / volume - cross(omega, centre), omega])
+
+
+def relaxation(
+    stiffness: Floats, pairs: NDArray[np.int64], moments: Floats, m: Coefficients, tau: float
+) -> Callable[[Floats], Floats]:
+    """The map from V = M Q to the V_tau of (I + tau M S) V_tau = M Q.
+
+    M takes forces Q = (F, T) to motions V = (v, omega), `velocities`; S says how forces answer to motion, dQ/dt = -S V. A
+    mode that relaxes at the rate lambda now does at lambda / (1 + tau lambda) < 1 / tau: an implicit Euler step
+    of length tau for the forces. Slow motion keeps its speed, but for a lag of tau.
+    stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over the ranks.
+    """
+    particles, size = len(moments), stiffness.shape[2]
+    units = np.broadcast_to(np.eye(size)[:, None, :], (size, particles, size))
+    M = np.stack([velocities(unit, moments, m) for unit in units], axis=2)
+    a, b = pairs[:, 0], pairs[:, 1]
+    block_rows, block_columns = np.concatenate([a, a, b, b]), np.concatenate([a, b, a, b])
+    S = np.concatenate([stiffness[:, 0], stiffness[:, 1], -stiffness[:, 0], -stiffness[:, 1]])
+    values = tau * np.einsum("pij,pjk->pik", M[block_rows], S)
+    rows = (block_rows[:, None, None] * size + np.arange(size)[None, :, None]) + np.zeros((1, 1, size), dtype=int)
+    columns = (block_columns[:, None, None] * size + np.arange(size)[None, None, :]) + np.zeros((1, size, 1), dtype=int)
+    count = particles * size
+    system = eye_array(count) + coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(count, count))
+    factors = splu(system.tocsc())
+    return lambda motion: factors.solve(motion.ravel()).reshape(motion.shape)

@@ -84,21 +84,20 @@ def move(new_u, new_owner, u, owner, slot_of):
 
 @jit
 def meeting(owner, chosen):
-    """Every pair of particles that the chosen points see together, as (pairs, 2); pairs repeat."""
-    count = 0
-    for p in chosen:
-        found = 0
-        for s in range(owner.shape[1]):
-            if owner[p, s] >= 0:
-                count += found
-                found += 1
-    pairs = np.empty((count, 2), dtype=np.int64)
-    count = 0
+    """Every pair of particles that one of the chosen rows of owner holds together, once: (pairs, 2)."""
+    seen = {np.int64(-1)}
     for p in chosen:
         for s in range(owner.shape[1]):
             for t in range(s):
-                if owner[p, s] >= 0 and owner[p, t] >= 0:
-                    pairs[count, 0] = owner[p, s]
-                    pairs[count, 1] = owner[p, t]
-                    count += 1
+                a = np.int64(owner[p, s])
+                b = np.int64(owner[p, t])
+                if a >= 0 and b >= 0:
+                    seen.add(min(a, b) << 32 | max(a, b))
+    pairs = np.empty((len(seen) - 1, 2), dtype=np.int64)
+    count = 0
+    for code in seen:
+        if code >= 0:
+            pairs[count, 0] = code >> 32
+            pairs[count, 1] = code & 0xFFFFFFFF
+            count += 1
     return pairs

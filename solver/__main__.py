@@ -1,7 +1,7 @@
 """`mpirun -n N python -P -m frit.solver CASE --out DIR` runs a case, `... --resume DIR` goes on with one.
 
-Signals: USR1 writes a checkpoint, TERM and INT write one and end the run. The end is told by run.json (`state`: running,
-done, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
+Signals: USR1 writes a checkpoint, TERM and INT write one and end the run. The end is told by run.json (`state`:
+running, done, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
 """
 
 import argparse
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import checkpoint, output
+from .arrays import Floats
 from .case import Case, CaseError, load_case
 from .checkpoint import CheckpointError
 from .geometry import Mesh, MeshError
@@ -31,8 +31,6 @@ from .run import RunError, run
 from .scheme import Scheme
 from .shape import ShapeError
 from .state import State
-
-Floats = NDArray[np.float64]
 
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
@@ -144,8 +142,8 @@ class Recorder:
     def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
         """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
         due = time.monotonic() - self.checkpoint_clock >= scheme.d.case.output.checkpoint_every
-        wanted = np.array([due and self.ranks.root, self.flags[signal.SIGUSR1], self.flags[signal.SIGTERM]], dtype=float)
-        due, asked, stop = self.ranks.max(wanted) > 0.0
+        wanted = [due and self.ranks.root, self.flags[signal.SIGUSR1], self.flags[signal.SIGTERM]]
+        due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
         if (due or asked) and not stop:
             self.checkpoint(scheme, state, integrator)
         self._show(scheme, state)

@@ -9,17 +9,15 @@ change its neighbours: it shares nodes with live points, and those nodes need it
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import kernels, slots
+from .arrays import Flags, Floats, Integers, Numbers
 from .discretisation import Discretisation
 from .rigid import rotations
 from .simd import LANES
 from .state import State, width
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Numbers = NDArray[np.int32]
+LEAST = 30.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,8 @@ class Active:
     live: Integers  # (L,) numbers of the live points
     owner: Numbers  # (L, slots) particle of each slot at the live points, -1: none
     mask: Floats  # (L, F) 1 for rho and the slots that exist at the live points, else 0
-    present: NDArray[np.bool_]  # (L, F / LANES) packs of columns that hold anything
-    several: NDArray[np.bool_]  # (L,) points that see more than one particle
+    present: Flags  # (L, F / LANES) packs of columns that hold anything
+    several: Flags  # (L,) points that see more than one particle
     nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
     owned: Integers  # those of them that this rank owns
     pairs: Integers  # (pairs, 2) particles a < b that a live point of any rank sees together
@@ -45,16 +43,15 @@ class Active:
 
     def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
         """Largest movement of a watched value, in units of its eps: at 1 the set must be made anew."""
-        return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta))
+        slot = 0.1 * LEAST * eps_eta
+        return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta, slot))
 
 
 def activate(d: Discretisation, state: State) -> Active:
-    """Make the set for the state. The state's order parameters below eps_eta are set to zero, and its slots are moved
-    where particles that shared one have come close. Collective; the result does not depend on the number of ranks.
+    """Make the set for the state. A particle's order parameter is set to zero at nodes that no point sees where it
+    exists (`LEAST`), and slots are moved where particles that shared one have come close. Collective; the result does
+    not depend on the number of ranks.
     """
-    switch = d.case.activation
-    if switch.few_order_parameters:
-        _drop_small(state, switch.eps_eta)
     flags, owner = _settle(d, state)
     table = d.shape
     low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
@@ -75,7 +72,7 @@ def activate(d: Discretisation, state: State) -> Active:
     moments = np.zeros((len(state.slot_of), 1 + d.dim))
     kernels.add_moments(moments, state.u, still, state.owner, d.mass, d.first_moment)
     watch = np.zeros(d.nodes, dtype=np.int64)
-    kernels.watch_nodes(watch, flags, owner, state.owner, table.offsets, table.nodes)
+    kernels.watch_nodes(watch, flags, owner, state.owner, table.offsets, table.nodes, table.rows, table.table)
     return Active(
         live=live,
         owner=owner[live],
@@ -96,18 +93,11 @@ def activate(d: Discretisation, state: State) -> Active:
     )
 
 
-def _drop_small(state: State, eps: float) -> None:
-    """An order parameter below eps is zero, and its slot is free again."""
-    small = np.abs(state.eta) < eps
-    state.eta[small] = 0.0
-    state.owner[small] = -1
-
-
 def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
     """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks.
 
-    Particles that clash move to other slots until none does. What has been seen to meet stays known, so this ends. Where
-    the particles then need fewer packs of slots than there are, all are dealt out anew.
+    Particles that clash move to other slots until none does. What has been seen to meet stays known, so this ends.
+    Where the particles then need fewer packs of slots than there are, all are dealt out anew.
     """
     known = np.empty((0, 2), dtype=np.int64)
     compact = True
@@ -118,7 +108,7 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
         if not d.case.activation.few_order_parameters:
             owner[:] = np.arange(owner.shape[1], dtype=np.int32)
             return flags, owner
-        claims, clashes = _claim(d, state, flags, owner, clash)
+        claims, clashes = _claim(d, state, owner, clash)
         met = slots.meeting(claims, np.arange(d.nodes))
         known = _everyones_pairs(d, np.concatenate([known, met, clashes]))
         clashes = _everyones_pairs(d, clashes)
@@ -131,23 +121,21 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
         columns = width(int(slot_of.max()) + 1)
         if not len(clashes) and columns >= state.u.shape[1]:
             state.owner = claims
+            state.eta[claims < 0] = 0.0
             return flags, owner
         state.slot_of = slot_of
         state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
 
 
-def _claim(
-    d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers
-) -> tuple[Numbers, Integers]:
-    """The owners of the nodes' slots with one ring of room, and the pairs of particles that want the same slot."""
-    marked = np.flatnonzero(flags)
-    claims = state.owner.copy()
-    crowded = np.empty((marked.size, 2), dtype=np.int64)
-    kernels.claim(claims, crowded, marked, owner[marked], d.shape.offsets, d.shape.nodes)
+def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:
+    """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot."""
+    claims = np.full_like(state.owner, -1)
+    crowded = np.empty_like(clash)
+    kernels.claim(claims, crowded, owner, d.shape.offsets, d.shape.nodes)
     mine = claims.copy()
     d.share.halo.most(claims)
     torn = (mine >= 0) & (mine != claims)
-    return claims, np.concatenate([clash[marked], crowded, np.stack([mine[torn], claims[torn]], axis=1)])
+    return claims, np.concatenate([clash, crowded, np.stack([mine[torn], claims[torn]], axis=1)])
 
 
 def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]:
@@ -156,7 +144,7 @@ def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]
     owner = np.empty((table.points, state.owner.shape[1]), dtype=np.int32)
     clash = np.empty((table.points, 2), dtype=np.int64)
     kernels.sense(
-        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, d.dim,
+        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, LEAST * switch.eps_eta, d.dim,
         table.offsets, table.nodes, table.rows, table.table,
     )
     return flags, owner, clash
@@ -175,7 +163,7 @@ def _spread(d: Discretisation, low: Integers, high: Integers) -> None:
     np.negative(low, out=low)
 
 
-def _touched(d: Discretisation, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _touched(d: Discretisation, chosen: Flags) -> Flags:
     """Which nodes a chosen point of any rank sees."""
     touched = np.zeros(d.nodes, dtype=np.int8)
     touched[d.shape.nodes[np.repeat(chosen, np.diff(d.shape.offsets))]] = 1

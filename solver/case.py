@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -34,11 +34,12 @@ from pydantic import (
 )
 from scipy.spatial import cKDTree
 
+from .arrays import Flags, Floats
+
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
 # --- vocabulary
 
-Floats = NDArray[np.float64]
 FINITE = Field(strict=True, allow_inf_nan=False)
 ONE_ZERO = AfterValidator(lambda x: x + 0.0)  # no -0.0: equal cases have one identity
 Number = Annotated[float, FINITE, ONE_ZERO]
@@ -131,11 +132,15 @@ def _about(table: type[BaseModel], field: str) -> str:
 
 
 class Domain(Table):
+    """The simulated box. Nothing crosses its walls."""
+
     size: Edges
     """edge lengths, nm; two: 2-D, three: 3-D; the lower corner is the origin"""
 
 
 class Nodes(Table):
+    """Where the mesh of nodes and material points comes from."""
+
     switches: ClassVar = ("source",)
     owned: ClassVar = {("lattice",): {"spacing": ...}, ("gmsh",): {"spacing": ...}, ("file",): {"path": ...}}
 
@@ -148,6 +153,8 @@ class Nodes(Table):
 
 
 class ShapeFunctions(Table):
+    """How fields are interpolated between the nodes; `linear` makes no use of gamma and tolerance."""
+
     kind: Literal["lme", "linear"] = "lme"
     """N_a, eq. (17): local maximum entropy, or linear finite elements on the same mesh"""
     gamma: Annotated[float, FINITE, Field(ge=0.5, le=6)] = 1.8
@@ -258,6 +265,8 @@ class Model(Table):
 
 
 class Time(Table):
+    """The run lasts from t = 0 to `end`, in the model's own unit of time."""
+
     switches: ClassVar = ("integrator",)
     owned: ClassVar = {("adaptive",): {"tolerance": 1e-3}, ("rk2",): {"step": None}}
 
@@ -285,6 +294,8 @@ class Activation(Table):
 
 
 class Every(Table):
+    """Evenly spaced snapshots, the other form of a list of times."""
+
     every: Positive
     """model time between snapshots [1], from t = 0"""
 
@@ -313,6 +324,7 @@ class Output(Table):
     """wall-clock seconds between checkpoints"""
 
     def snapshot_times(self, end: float) -> tuple[float, ...]:
+        """The times [1] of all snapshots of a run to `end`; round-off does not lose the last of `every`."""
         if not isinstance(self.snapshots, Every):
             return self.snapshots
         every = self.snapshots.every
@@ -343,6 +355,7 @@ class Case(Table):
 
     @property
     def dim(self) -> int:
+        """2 or 3."""
         return len(self.domain.size)
 
     @field_validator("nodes")
@@ -409,6 +422,7 @@ class Case(Table):
         return tree
 
     def resolved_json(self) -> str:
+        """The case as a JSON case file that needs no defaults and no CSV: `load_case` gives an equal case."""
         return json.dumps(self._tree(), indent=2, ensure_ascii=False) + "\n"
 
     def identity(self) -> str:
@@ -437,9 +451,9 @@ def _inner_box(domain: Domain | None, particles: Particles | None) -> Box:
     return tuple(lower.tolist()), tuple(upper.tolist())
 
 
-def _outside(lower: Floats, upper: Floats, case: Case) -> NDArray[np.bool_]:
+def _outside(lower: Floats, upper: Floats, case: Case) -> Flags:
     size = np.array(case.domain.size)
-    outside: NDArray[np.bool_] = (lower < -ROUND_OFF * size) | (upper > size * (1 + ROUND_OFF))
+    outside: Flags = (lower < -ROUND_OFF * size) | (upper > size * (1 + ROUND_OFF))
     return np.asarray(outside.any(axis=-1))
 
 
@@ -562,7 +576,8 @@ def _table(loc: Place) -> type[BaseModel]:
     table: Any = Case
     for part in loc[:-1]:
         table = Every if part in ("snapshots", "|every") else table.model_fields[part].annotation
-    return table  # type: ignore[no-any-return]
+    found: type[BaseModel] = table
+    return found
 
 
 def _known(loc: Place) -> str:

@@ -39,7 +39,10 @@ class Checkpoint:
 def write(
     directory: Path, scheme: Scheme, state: State, collector: Collector, mesh: Mesh, notes: dict[str, Any]
 ) -> None:
-    """Collective; rank 0 writes beside the old file, makes it durable, and renames. notes: identity, memory, wall_time."""
+    """Collective; rank 0 writes beside the old file, makes it durable, and renames.
+
+    notes: identity, memory, wall_time.
+    """
     fields = {
         "u": collector.whole(state.u),
         "owner": collector.whole(state.owner),
@@ -73,7 +76,8 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
     if notes["identity"] != identity:
         raise CheckpointError(f"{path}: belongs to another case than case.json")
     if attributes["mesh"] != mesh_hash(mesh):
-        raise CheckpointError(f"{path}: the mesh has changed since: {attributes['nodes']} nodes then, {len(mesh.nodes)} now")
+        then = attributes["nodes"]
+        raise CheckpointError(f"{path}: the mesh has changed since: {then} nodes then, {len(mesh.nodes)} now")
     counts = float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])
     state = State(*counts, values["u"], values["owner"], values["slot_of"])
     reference = State(*counts, values["reference"], values["owner"], values["slot_of"])

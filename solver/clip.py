@@ -1,18 +1,14 @@
 """The part of each cell in a box: exact volumes and centroids, for averages over a box that cuts cells."""
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import Floats, Integers, Numbers
 from .jit import jit
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
-Counts = npt.NDArray[np.int64]
 
 DEPTH = 16  # of the stack: at most 6 cuts, each replaces the simplex on top by at most 3: 1 + 6 * 2 = 13
 
 
-def clip_cells(nodes: Floats, cells: Ints, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
+def clip_cells(nodes: Floats, cells: Numbers, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
     """Volumes (p,) and centroids (p, dim) of the cells' intersections with the box [lower, upper].
 
     The integral of a linear field over the box is sum_p volume_p field(centroid_p), exactly. A cell outside
@@ -28,7 +24,7 @@ def clip_cells(nodes: Floats, cells: Ints, lower: Floats, upper: Floats) -> tupl
 
 
 @jit
-def clip(volumes: Floats, centroids: Floats, nodes: Floats, cells: Ints, bounds: Floats) -> None:
+def clip(volumes: Floats, centroids: Floats, nodes: Floats, cells: Numbers, bounds: Floats) -> None:
     """Cut each cell by half-space after half-space, depth first, and gather the simplices that are left over.
 
     Half-space i < dim: x_i >= bounds_i; half-space i >= dim: -x_(i - dim) >= bounds_i.
@@ -76,7 +72,7 @@ def arrange(x: Floats, distance: Floats, simplex: Floats, plane: int, bounds: Fl
 
 @jit
 def replace(
-    stack: Floats, done: Counts, top: int, kept: int, x: Floats, distance: Floats, prism: Floats
+    stack: Floats, done: Integers, top: int, kept: int, x: Floats, distance: Floats, prism: Floats
 ) -> int:
     """Put the kept part of simplex x, cut into simplices, in place of the one on top; return the new top."""
     dim: int = x.shape[1]

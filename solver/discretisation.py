@@ -3,16 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .arrays import Floats, Numbers
 from .case import Case
 from .energy import Coefficients
 from .geometry import Mesh
 from .partition import Halo, Ranks, Share, bisect
-from .shape import ShapeError, ShapeTable, linear, lme, search_range
-
-Floats = NDArray[np.float64]
+from .shape import ShapeError, ShapeTable, linear, lme
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Discretisation:
     @property
     def dim(self) -> int:
         """2 or 3."""
-        return self.x.shape[1]
+        return int(self.x.shape[1])
 
     @property
     def nodes(self) -> int:
@@ -46,7 +44,7 @@ class Discretisation:
 
 
 def shape_table(
-    case: Case, points: Floats, spacing: Floats, cells: NDArray[np.int32], nodes: Floats, tree: cKDTree | None = None
+    case: Case, points: Floats, spacing: Floats, cells: Numbers, nodes: Floats, tree: cKDTree | None = None
 ) -> ShapeTable:
     """The shape functions that the case asks for, at points in the given cells; tree: of the nodes, if it exists."""
     given = case.shape_functions
@@ -83,8 +81,8 @@ def _moments(table: ShapeTable, weights: Floats, x: Floats, nodes: int) -> tuple
     """This rank's parts of m_a and q_a."""
     counts = np.diff(table.offsets)
     wN = np.repeat(weights, counts) * table.entries()[0]
-    mass = np.bincount(table.nodes, wN, minlength=nodes)
-    moment = [np.bincount(table.nodes, wN * np.repeat(x[:, k], counts), minlength=nodes) for k in range(x.shape[1])]
+    shares = [wN, *(wN * np.repeat(x[:, k], counts) for k in range(x.shape[1]))]
+    mass, *moment = (np.asarray(np.bincount(table.nodes, share, nodes), dtype=np.float64) for share in shares)
     return mass, np.stack(moment, axis=1)
 
 
@@ -99,15 +97,6 @@ def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:
             f"node {a} at {np.array2string(mesh.nodes[a], precision=6)} nm is in range of no material point: "
             "its volume m_a is 0"
         )
-
-
-def ring(case: Case, mesh: Mesh) -> float:
-    """How far one evaluation carries a value, nm: twice the farthest that a point sees."""
-    given = case.shape_functions
-    if given.kind == "lme":
-        return 2.0 * float(search_range(mesh.spacing, given.gamma, given.tolerance).max())
-    corners = mesh.nodes[mesh.cells] - mesh.points[:, None, :]
-    return 2.0 * float(np.linalg.norm(corners, axis=2).max())
 
 
 def activity(mesh: Mesh, u: Floats, eps: float) -> Floats:

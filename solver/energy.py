@@ -4,9 +4,12 @@ Every function takes point values: rho, the sums S2 = sum eta^2 and S3 = sum eta
 Source: Huang et al. (2023), equations (2), (5), (30), (31); Wang (2006).
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from .jit import jit
+from .simd import Pack
+
+Field = TypeVar("Field", float, Pack)  # one order parameter, or a pack of them
 
 
 class Coefficients(NamedTuple):
@@ -42,7 +45,7 @@ def df_drho(rho: float, S2: float, S3: float, m: Coefficients) -> float:
 
 
 @jit
-def df_deta(eta: float, rho: float, S2: float, m: Coefficients) -> float:
+def df_deta(eta: Field, rho: float, S2: float, m: Coefficients) -> Field:
     """df/deta_a = 12 B [ (1 - rho) eta_a - (2 - rho) eta_a^2 + eta_a S2 ]   (30)"""
     return 12.0 * m.B * eta * ((1.0 - rho) - (2.0 - rho) * eta + S2)
 
@@ -51,8 +54,8 @@ def df_deta(eta: float, rho: float, S2: float, m: Coefficients) -> float:
 def mobility(rho: float, overlap: float, m: Coefficients) -> float:
     """D = D_vol phi + D_vap (1 - phi) + D_surf rho (1 - rho) + D_gb sum_a sum_{b != a} eta_a eta_b   (5)
 
-    phi = rho^3 (10 - 15 rho + 6 rho^2). `overlap` is the double sum over ordered pairs. A diffuse model leaves [0, 1] by
-    a little, where D would turn negative: D sees rho clamped to [0, 1] and the overlap clamped to >= 0.
+    phi = rho^3 (10 - 15 rho + 6 rho^2). `overlap` is the double sum over ordered pairs. A diffuse model leaves [0, 1]
+    by a little, where D would turn negative: D sees rho clamped to [0, 1] and the overlap clamped to >= 0.
     """
     r = min(max(rho, 0.0), 1.0)
     phi = r**3 * (10.0 - 15.0 * r + 6.0 * r**2)

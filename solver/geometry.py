@@ -16,15 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
+
+from .arrays import Codes, Floats, Integers, Numbers
 
 if TYPE_CHECKING:
     from .case import Nodes
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
-Indices = npt.NDArray[np.intp]
 
 GMSH_LIBRARIES = "apt-get install libglu1-mesa libgl1 libxrender1 libxcursor1 libxft2 libxinerama1 libgomp1"
 GMSH_OPTIONS = {"General.Terminal": 0, "General.NumThreads": 1, "Mesh.RandomSeed": 1, "Mesh.Algorithm": 6}
@@ -44,7 +41,7 @@ class Mesh:
     """n nodes and p simplex cells in dim = 2 or 3 dimensions; lengths in nm."""
 
     nodes: Floats  # (n, dim)
-    cells: Ints  # (p, dim + 1) node numbers, positively oriented
+    cells: Numbers  # (p, dim + 1) node numbers, positively oriented
     points: Floats  # (p, dim) barycentres x_p
     weights: Floats  # (p,) cell volumes w_p, nm^dim
     spacing: Floats  # (p,) local nodal spacing h
@@ -88,7 +85,7 @@ def _lines(length: float, n: int) -> tuple[Floats, Floats]:
     return ends, np.concatenate([[0.0], (ends[1:] + ends[:-1]) / 2, [length]])
 
 
-def _triangular(box: tuple[float, ...], counts: Sequence[int]) -> tuple[Floats, Ints]:
+def _triangular(box: tuple[float, ...], counts: Sequence[int]) -> tuple[Floats, Numbers]:
     """Rows along x: even ones at the ends of nx intervals, odd ones at their centres and on both walls."""
     nx, ny = counts
     ends, centres = _lines(box[0], nx)
@@ -106,7 +103,7 @@ def _triangular(box: tuple[float, ...], counts: Sequence[int]) -> tuple[Floats, 
     return nodes, np.concatenate([based_on_even.reshape(-1, 3), based_on_odd.reshape(-1, 3)])
 
 
-def _body_centred(box: tuple[float, ...], counts: Sequence[int]) -> tuple[Floats, Ints]:
+def _body_centred(box: tuple[float, ...], counts: Sequence[int]) -> tuple[Floats, Numbers]:
     """Vertices and centres of nx * ny * nz bricks, and the centres of the bricks' faces on the walls.
 
     A face between two bricks gives four tetrahedra (centre, centre, edge of the face). On a wall the second
@@ -153,7 +150,7 @@ def gmsh_mesh(size: Sequence[float], spacing: float) -> Mesh:
     return _build(nodes.clip(0.0, box), cells, None)
 
 
-def _generate(gmsh: Any, box: tuple[float, ...], spacing: float) -> tuple[Floats, Ints]:
+def _generate(gmsh: Any, box: tuple[float, ...], spacing: float) -> tuple[Floats, Numbers]:
     dim = len(box)
     for name, value in {**GMSH_OPTIONS, "Mesh.MeshSizeMin": spacing, "Mesh.MeshSizeMax": spacing}.items():
         gmsh.option.setNumber(name, value)
@@ -204,7 +201,7 @@ def _read(path: str | Path) -> Any:
         raise MeshError(f"{path}: meshio cannot read it: {reason}") from error
 
 
-def _refuse_outside(path: str | Path, nodes: Floats, used: Indices, box: Floats) -> None:
+def _refuse_outside(path: str | Path, nodes: Floats, used: Integers, box: Floats) -> None:
     dim, x, slack = len(box), nodes[used], OUTSIDE * box
     inside = ((x[:, :dim] >= -slack) & (x[:, :dim] <= box + slack)).all(axis=1) & np.isfinite(x).all(axis=1)
     if not inside.all():
@@ -215,7 +212,7 @@ def _refuse_outside(path: str | Path, nodes: Floats, used: Indices, box: Floats)
         raise MeshError(f"{path}: not planar: z from {x[:, dim].min()} to {x[:, dim].max()} in a 2-D domain")
 
 
-def _build(nodes: Floats, cells: Ints, spacing: float | None) -> Mesh:
+def _build(nodes: Floats, cells: Numbers, spacing: float | None) -> Mesh:
     """Check, orient (in place) and order; spacing None: measure it. Errors number them as given."""
     used = np.zeros(len(nodes), dtype=np.bool_)
     for column in cells.T:
@@ -241,7 +238,7 @@ def _build(nodes: Floats, cells: Ints, spacing: float | None) -> Mesh:
     return Mesh(nodes, cells, points, weights, local)
 
 
-def _measure(nodes: Floats, cells: Ints) -> tuple[Floats, Floats]:
+def _measure(nodes: Floats, cells: Numbers) -> tuple[Floats, Floats]:
     """Signed volumes det(x_1 - x_0, ..., x_dim - x_0) / dim! and barycentres of the cells."""
     dim = nodes.shape[1]
     volumes, points = np.empty(len(cells)), np.empty((len(cells), dim))
@@ -262,7 +259,7 @@ def _determinant(e: list[Floats]) -> Floats:
     return np.asarray(e[0][0] * minors[0] + e[0][1] * minors[1] + e[0][2] * minors[2])
 
 
-def _refuse_flat(nodes: Floats, cells: Ints, volumes: Floats, extent: float) -> None:
+def _refuse_flat(nodes: Floats, cells: Numbers, volumes: Floats, extent: float) -> None:
     """No edge is longer than sqrt(dim) extent: only cells that are flat against that need a closer look."""
     dim = nodes.shape[1]
     for cell in np.flatnonzero(np.abs(volumes) <= FLAT * (math.sqrt(dim) * extent) ** dim):
@@ -272,7 +269,7 @@ def _refuse_flat(nodes: Floats, cells: Ints, volumes: Floats, extent: float) -> 
             raise MeshError(f"{CELL_KIND[dim]} {cell} has no volume: nodes {cells[cell]} at {x.tolist()}")
 
 
-def _along_curve(x: Floats, lower: Floats, extent: float) -> Indices:
+def _along_curve(x: Floats, lower: Floats, extent: float) -> Integers:
     """The order of x along Morton's curve in the cube at `lower`: near in space comes to lie near in memory.
 
     The code interleaves integer coordinates of 31 bits each in 2-D, 21 in 3-D. Ties keep their order.
@@ -286,7 +283,7 @@ def _along_curve(x: Floats, lower: Floats, extent: float) -> Indices:
     return np.argsort(code, kind="stable")
 
 
-def _spread(x: npt.NDArray[np.uint64], dim: int) -> npt.NDArray[np.uint64]:
+def _spread(x: Codes, dim: int) -> Codes:
     """Move bit i of x to bit dim * i, in groups of 16 bits, then 8, 4, 2 and 1."""
     for group in (16, 8, 4, 2, 1):
         mask = sum((2**group - 1) << shift for shift in range(0, 64, dim * group)) % 2**64
@@ -294,7 +291,7 @@ def _spread(x: npt.NDArray[np.uint64], dim: int) -> npt.NDArray[np.uint64]:
     return x
 
 
-def _local_spacing(nodes: Floats, cells: Ints, numbers: Indices) -> Floats:
+def _local_spacing(nodes: Floats, cells: Numbers, numbers: Integers) -> Floats:
     """Per node the mean distance to its 2 dim + 2 nearest others; per point the mean over its cell."""
     count = min(2 * nodes.shape[1] + 2, len(nodes) - 1)
     distances = np.asarray(cKDTree(nodes).query(nodes, count + 1)[0])[:, 1:]

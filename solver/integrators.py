@@ -8,15 +8,13 @@ from math import ceil, sqrt
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import kernels
+from .arrays import Floats
 from .case import Case
 from .partition import Ranks
 from .scheme import Scheme
 from .state import State
-
-Floats = NDArray[np.float64]
 
 
 class Integrator(Protocol):
@@ -44,8 +42,11 @@ def paper_step(shortest: float, case: Case) -> float:
 
 
 def contact_time(shortest: float, case: Case) -> float:
-    """tau = 2 dt (tolerance / 10^-3) with the paper's dt: at the default tolerance contacts are then about as stiff as the
-    diffusion on the same nodes, and the lag that tau brings falls with the tolerance."""
+    """tau = 2 dt (tolerance / 10^-3) with the paper's dt.
+
+    At the default tolerance contacts are then about as stiff as the diffusion on the same nodes, and the lag that tau
+    brings falls with the tolerance.
+    """
     tolerance = case.time.tolerance
     return 2.0 * paper_step(shortest, case) * (1.0 if tolerance is None else tolerance / 1e-3)
 
@@ -99,9 +100,9 @@ MARGIN = 1.2  # factor on an estimate of the spectral radius
 class Chebyshev:
     """Runge-Kutta-Chebyshev of order 2 with error control (Sommeijer, Shampine & Verwer 1997).
 
-    s stages are stable for dt |lambda| < 0.65 s^2 on the negative real axis: the cost of a step grows with the square root of its
-    length. The error of a step is estimated from its end points; steps aim at `tolerance` in the volume-weighted root
-    mean square of e / (1 + |u|) over the nodes that change.
+    s stages are stable for dt |lambda| < 0.65 s^2 on the negative real axis: the cost of a step grows with the square
+    root of its length. The error of a step is estimated from its end points; steps aim at `tolerance` in the
+    volume-weighted root mean square of e / (1 + |u|) over the nodes that change.
     """
 
     stops_at_events = False
@@ -246,9 +247,10 @@ def _total(ranks: Ranks, value: float) -> float:
 
 
 def coefficients(stages: int, dt: float) -> Floats:
-    """Rows c (stages, 5) of Y_j = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0; row 0 is Y_1 = Y_0 + c_4 F_0.
+    """Rows c (stages, 5) of Y_j = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0.
 
-    From Chebyshev polynomials at w_0 = 1 + (2/13) / s^2, damped so that the stability region is a strip (RKC, eq. 2.6).
+    Row 0 is Y_1 = Y_0 + c_4 F_0. From Chebyshev polynomials at w_0 = 1 + (2/13) / s^2, damped so that the stability
+    region is a strip (RKC, eq. 2.6).
     """
     w0 = 1.0 + 2.0 / (13.0 * stages**2)
     T, dT, ddT = np.zeros((3, stages + 1))

@@ -32,10 +32,10 @@ def cache_folder() -> Path:
     return Path(os.environ.get("FRIT_CACHE_DIR", default)) / digest.hexdigest()[:16]
 
 
-numba.config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]
+numba.config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-OPTIONS = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
+OPTIONS: dict[str, Any] = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 
 
 def jit(function: Function) -> Function:

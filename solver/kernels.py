@@ -2,23 +2,27 @@
 
 Layout. `u` (n, F) holds a node's fields side by side: column 0 is rho, column 1 + s is slot s of eta, F is a multiple
 of LANES. Point p sees nodes[offsets[p] + i] for i < offsets[p + 1] - offsets[p], with the shape functions
-table[:, rows[p] + i] = (N, dN/dx, dN/dy[, dN/dz]); on a lattice most points share
-one row of the table. Rows start at multiples of LANES and are filled up with zeros. `live` lists the points that are integrated, l counts along
-it, and owner[l, s] is the particle that slot s means at that point, or -1: such a slot does not exist there, mask[l] is
-0 in its column, and present[l, b] tells whether pack b of columns holds anything at all.
+table[:, rows[p] + i] = (N, dN/dx, dN/dy[, dN/dz]); on a lattice most points share one row of the table. Rows start at
+multiples of LANES and are filled up with zeros. `live` lists the points that are integrated, l counts along it, and
+owner[l, s] is the particle that slot s means at that point, or -1: such a slot does not exist there, mask[l] is 0 in
+its column, and present[l, b] tells whether pack b of columns holds anything at all.
 Point fields are kept in `point` (L (1 + dim), F): row l (1 + dim) holds the values at live point l, the next dim rows
 their derivatives.
 """
 
 import numpy as np
 
-from .energy import df_deta, df_drho, free_energy_density, mobility
+from .arrays import Flags, Floats, Integers, Numbers
+from .energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
 from .simd import LANES, first, load, positive, splat, store, total, with_first
 
 
 @inlined
-def gather(point, u, row, begin, count, start, nodes, table, column):
+def gather(
+    point: Floats, u: Floats, row: int,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats, column: int,
+) -> None:
     """u_p = sum_a N_a(x_p) u_a and grad u_p = sum_a grad N_a(x_p) u_a for one point and one pack of fields   (17)"""
     dim = table.shape[0] - 1
     value = splat(0.0)
@@ -41,7 +45,10 @@ def gather(point, u, row, begin, count, start, nodes, table, column):
 
 
 @inlined
-def scatter(rate, point, row, begin, count, start, nodes, table, column):
+def scatter(
+    rate: Floats, point: Floats, row: int,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats, column: int,
+) -> None:
     """rate_a += N_a(x_p) s_p + grad N_a(x_p) . j_p for one point's sources s and fluxes j (the rows of `point`)."""
     dim = table.shape[0] - 1
     source = load(point, row, column)
@@ -58,7 +65,10 @@ def scatter(rate, point, row, begin, count, start, nodes, table, column):
 
 
 @inlined
-def add_potential(W, w, row, point, rho, S2, S3, begin, count, start, nodes, table, work, m):
+def add_potential(
+    W: Floats, w: float, row: int, point: Floats, rho: float, S2: float, S3: float,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats, work: Floats, m: Coefficients,
+) -> None:
     """W_a += w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]: one point's share of (24), before the 1/m_a.
 
     work (1, longest row of the table) holds the shares while they are computed in packs along the row.
@@ -79,7 +89,9 @@ def add_potential(W, w, row, point, rho, S2, S3, begin, count, start, nodes, tab
 
 
 @inlined
-def gradient(result, W, begin, count, start, nodes, table, work):
+def gradient(
+    result: Floats, W: Floats, begin: int, count: int, start: int, nodes: Numbers, table: Floats, work: Floats
+) -> None:
     """result = sum_a grad N_a(x_p) W_a at one point   (23)"""
     for i in range(count):
         work[0, i] = W[nodes[begin + i]]
@@ -98,7 +110,9 @@ def gradient(result, W, begin, count, start, nodes, table, work):
 
 
 @jit
-def add_contact(force, point, row, l, owner, w, x, m):
+def add_contact(
+    force: Floats, point: Floats, row: int, l: int, owner: Numbers, w: float, x: Floats, m: Coefficients
+) -> None:
     """Add b_a w_p and (x_p cross b_a) w_p of every touching pair to the particles' forces and torques   (25)-(27)
 
     b_a = k sum_{b != a} (rho - rho_0) [eta_a eta_b > c] (grad eta_a - grad eta_b). force (particles, dim + rotations);
@@ -139,9 +153,10 @@ def add_contact(force, point, row, l, owner, w, x, m):
 
 @jit
 def potential(
-    W, force, point, D, squares, u, live, owner, mask, present, several, weights, x, offsets, nodes, rows, table,
-    work, m, rigid,
-):
+    W: Floats, force: Floats, point: Floats, D: Floats, squares: Floats, u: Floats,
+    live: Integers, owner: Numbers, mask: Floats, present: Flags, several: Flags, weights: Floats, x: Floats,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients, rigid: bool,
+) -> None:
     """First half of an evaluation: fields at the live points, D, their shares of W, and the contact forces.
 
     W (n,) gets partial sums, force (particles, dim + rotations) is added to where `rigid`; point, D and squares = S2
@@ -187,11 +202,15 @@ def potential(
 
 
 @jit
-def contact_stiffness(stiffness, keys, point, live, owner, several, weights, x, particles, m, huang):
+def contact_stiffness(
+    stiffness: Floats, keys: Integers, point: Floats, live: Integers, owner: Numbers, several: Flags,
+    weights: Floats, x: Floats, particles: int, m: Coefficients, huang: bool,
+) -> None:
     """How the contact forces answer to rigid motion: stiffness[pair] += w_p k e_p (d_a, d_b) over touching points.
 
     Moving particle c with (v, omega) changes rho at x by -(v, omega) . d_c, d_c = (grad q, x cross grad q) with
-    q = rho eta_c^2 [`wang`: rho eta_c]; the force on a is k (rho - rho_0) e, e = (g, x cross g), g = grad eta_a - grad eta_b.
+    q = rho eta_c^2 [`wang`: rho eta_c]; the force on a is k (rho - rho_0) e, e = (g, x cross g) with
+    g = grad eta_a - grad eta_b.
     stiffness (pairs, 2, dim + rotations, dim + rotations); keys (pairs,) sorted a particles + b with a < b. Expects the
     fields that `potential` left in `point`.
     """
@@ -225,17 +244,17 @@ def contact_stiffness(stiffness, keys, point, live, owner, several, weights, x, 
 
 
 @jit
-def carried_slope(point, row, column, k, huang):
+def carried_slope(point: Floats, row: int, column: int, k: int, huang: bool) -> float:
     """Component k of grad(rho eta^2) [`wang`: grad(rho eta)] at a point."""
     rho = point[row, 0]
     eta = point[row, column]
     if huang:
-        return eta * eta * point[row + 1 + k, 0] + 2.0 * rho * eta * point[row + 1 + k, column]
-    return eta * point[row + 1 + k, 0] + rho * point[row + 1 + k, column]
+        return float(eta * eta * point[row + 1 + k, 0] + 2.0 * rho * eta * point[row + 1 + k, column])
+    return float(eta * point[row + 1 + k, 0] + rho * point[row + 1 + k, column])
 
 
 @jit
-def turn(vector, x):
+def turn(vector: Floats, x: Floats) -> None:
     """Append x cross v to v: one number in the plane, three in space."""
     if x.shape[0] == 2:
         vector[2] = x[0] * vector[1] - x[1] * vector[0]
@@ -246,17 +265,17 @@ def turn(vector, x):
 
 
 @inlined
-def rigid_velocity(motion, a, x, k, dim):
+def rigid_velocity(motion: Floats, a: int, x: Floats, k: int, dim: int) -> float:
     """Component k of V_a(x) = v_a + omega_a cross x; motion[a] = (v_a, omega_a), v_a taken at the origin of x."""
     if dim == 2:
-        return motion[a, 0] - motion[a, 2] * x[1] if k == 0 else motion[a, 1] + motion[a, 2] * x[0]
+        return float(motion[a, 0] - motion[a, 2] * x[1] if k == 0 else motion[a, 1] + motion[a, 2] * x[0])
     i = (k + 1) % 3
     j = (k + 2) % 3
-    return motion[a, k] + motion[a, 3 + i] * x[j] - motion[a, 3 + j] * x[i]
+    return float(motion[a, k] + motion[a, 3 + i] * x[j] - motion[a, 3 + j] * x[i])
 
 
 @inlined
-def fill_velocities(velocity, motion, owner, l, x):
+def fill_velocities(velocity: Floats, motion: Floats, owner: Numbers, l: int, x: Floats) -> None:
     """velocity[k, 1 + s] = component k of V_a(x), a = owner[l, s]; 0 where a slot does not exist."""
     for s in range(owner.shape[1]):
         a = owner[l, s]
@@ -266,9 +285,11 @@ def fill_velocities(velocity, motion, owner, l, x):
 
 @jit
 def divergence(
-    rate, point, D, squares, W, motion, velocity, live, owner, present, weights, x, offsets, nodes, rows,
-    table, work, m, rigid, huang,
-):
+    rate: Floats, point: Floats, D: Floats, squares: Floats, W: Floats, motion: Floats, velocity: Floats,
+    live: Integers, owner: Numbers, present: Flags, weights: Floats, x: Floats,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats,
+    m: Coefficients, rigid: bool, huang: bool,
+) -> None:
     """Second half of an evaluation: the fluxes at the live points, scattered to the nodes   (20), (21)
 
     rate (n, F) gets partial sums, before the 1/m_a. The rows of `point` are turned from fields into sources and fluxes:
@@ -312,8 +333,11 @@ def divergence(
 
 
 @jit
-def free_energy(u, weights, dim, offsets, nodes, rows, table, m):
-    """F = sum_p w_p [ f + kappa_rho/2 |grad rho|^2 + kappa_eta/2 sum |grad eta|^2 ] over all points of this rank   (1)"""
+def free_energy(
+    u: Floats, weights: Floats, dim: int,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, m: Coefficients,
+) -> float:
+    """F = sum_p w_p [ f + kappa_rho/2 |grad rho|^2 + kappa_eta/2 sum |grad eta|^2 ] over this rank's points   (1)"""
     point = np.empty((1 + dim, u.shape[1]))
     total = 0.0
     for p in range(weights.size):
@@ -336,11 +360,16 @@ def free_energy(u, weights, dim, offsets, nodes, rows, table, m):
 
 
 @jit
-def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, nodes, rows, table):
+def sense(
+    flags: Numbers, owner: Numbers, clash: Integers, u: Floats, node_owner: Numbers,
+    eps_rho: float, eps_eta: float, least: float, dim: int,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+) -> None:
     """Mark the points where something happens and name the particles that their slots mean (section 2.4).
 
     flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s] is the particle found in slot s
-    of the point's nodes, if its eta or |grad eta| is at least eps_eta here; where there are two, clash[p] = (one, other).
+    of the point's nodes, if its eta or |grad eta| is at least `least` here; where there are two,
+    clash[p] = (one, other).
     """
     point = np.empty((1 + dim, u.shape[1]))
     for p in range(flags.size):
@@ -350,11 +379,10 @@ def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, no
         clash[p, 0] = -1
         for s in range(node_owner.shape[1]):
             owner[p, s] = -1
-            slope = steep(point, 1 + s, eps_eta)
-            if not slope and abs(point[0, 1 + s]) < eps_eta:
-                continue
-            if slope:
+            if steep(point, 1 + s, eps_eta):
                 flags[p] = 1
+            if not steep(point, 1 + s, least) and abs(point[0, 1 + s]) < least:
+                continue
             for e in range(offsets[p], offsets[p + 1]):
                 a = node_owner[nodes[e], s]
                 b = owner[p, s]
@@ -365,7 +393,7 @@ def sense(flags, owner, clash, u, node_owner, eps_rho, eps_eta, dim, offsets, no
 
 
 @jit
-def steep(point, column, eps):
+def steep(point: Floats, column: int, eps: float) -> bool:
     """Whether the gradient of a field at a point is at least eps."""
     square = 0.0
     for k in range(1, point.shape[0]):
@@ -374,28 +402,31 @@ def steep(point, column, eps):
 
 
 @jit
-def claim(node_owner, clash, marked, owner, offsets, nodes):
-    """Let the marked points' particles claim the nodes they scatter to: one ring of room to grow.
+def claim(node_owner: Numbers, clash: Integers, owner: Numbers, offsets: Integers, nodes: Numbers) -> None:
+    """Let the particles claim the nodes of every point at which they exist: where they are, and a ring to grow into.
 
-    Where a node's slot is already another particle's, clash[l] = (one, other).
+    Where a node's slot is already another particle's, clash[p] = (one, other).
     """
-    for l in range(marked.size):
-        clash[l, 0] = -1
+    for p in range(owner.shape[0]):
+        clash[p, 0] = -1
         for s in range(owner.shape[1]):
-            a = owner[l, s]
+            a = owner[p, s]
             if a < 0:
                 continue
-            for e in range(offsets[marked[l]], offsets[marked[l] + 1]):
+            for e in range(offsets[p], offsets[p + 1]):
                 holder = node_owner[nodes[e], s]
                 if holder < 0:
                     node_owner[nodes[e], s] = a
                 elif holder != a:
-                    clash[l, 0] = min(a, holder)
-                    clash[l, 1] = max(a, holder)
+                    clash[p, 0] = min(a, holder)
+                    clash[p, 1] = max(a, holder)
 
 
 @jit
-def interiors(low, high, flags, owner, u, offsets, nodes, rows, table):
+def interiors(
+    low: Integers, high: Integers, flags: Numbers, owner: Numbers, u: Floats,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+) -> None:
     """low[a], high[a]: smallest and largest particle number whose switched-off interior (eta > 1/2) reaches node a."""
     for p in range(flags.size):
         if flags[p]:
@@ -408,7 +439,9 @@ def interiors(low, high, flags, owner, u, offsets, nodes, rows, table):
 
 
 @jit
-def interior_slot(u, p, owner, offsets, nodes, rows, table):
+def interior_slot(
+    u: Floats, p: int, owner: Numbers, offsets: Integers, nodes: Numbers, rows: Integers, table: Floats
+) -> int:
     """The slot with eta_p > 1/2 at point p, or -1."""
     for s in range(owner.shape[1]):
         if owner[p, s] >= 0:
@@ -421,16 +454,28 @@ def interior_slot(u, p, owner, offsets, nodes, rows, table):
 
 
 @jit
-def watch_nodes(watch, flags, owner, node_owner, offsets, nodes):
-    """watch[a]: bit 0 where a switched-off point needs node a, bit 1 + s where slot s is missing at a live point of it.
+def watch_nodes(
+    watch: Integers,
+    flags: Numbers,
+    owner: Numbers,
+    node_owner: Numbers,
+    offsets: Integers,
+    nodes: Numbers,
+    rows: Integers,
+    table: Floats,
+) -> None:
+    """watch[a]: bit 0 where a switched-off point needs node a, bit 1 + s where a live point near it lacks slot s.
 
-    These nodal values decide whether the set of live points and slots still holds.
+    These nodal values decide whether the set of live points and slots still holds. A node counts as near where its
+    N_a(x_p) is at least 2 %: farther ones say little of the slot's value at the point.
     """
     for p in range(flags.size):
-        for e in range(offsets[p], offsets[p + 1]):
-            a = nodes[e]
+        for i in range(offsets[p + 1] - offsets[p]):
+            a = nodes[offsets[p] + i]
             if not flags[p]:
                 watch[a] |= 1
+                continue
+            if table[0, rows[p] + i] < 0.02:
                 continue
             for s in range(owner.shape[1]):
                 if node_owner[a, s] >= 0 and owner[p, s] != node_owner[a, s]:
@@ -438,7 +483,10 @@ def watch_nodes(watch, flags, owner, node_owner, offsets, nodes):
 
 
 @jit
-def still_shares(W, drift, flags, edge, owner, u, weights, x, offsets, nodes, rows, table, work, m, huang):
+def still_shares(
+    W: Floats, drift: Floats, flags: Numbers, edge: Integers, owner: Numbers, u: Floats, weights: Floats, x: Floats,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients, huang: bool,
+) -> None:
     """What switched-off points owe to the nodes they share with live ones, as long as their fields stand still.
 
     W (n,) gets their shares of (24). drift (edges, 2, dim + rotations) gets their shares of the advection of rho and of
@@ -473,7 +521,7 @@ def still_shares(W, drift, flags, edge, owner, u, weights, x, offsets, nodes, ro
 
 
 @jit
-def add_drift(drift, carried, swept, entry, x):
+def add_drift(drift: Floats, carried: float, swept: float, entry: Floats, x: Floats) -> None:
     """Add one table entry's grad N and x cross grad N to the drift of rho (row 0) and of eta (row 1)."""
     dim = x.shape[0]
     for k in range(dim):
@@ -495,7 +543,9 @@ def add_drift(drift, carried, swept, entry, x):
 
 
 @jit
-def add_still_drift(rate, drift, edge_nodes, edge_particle, slot_of, motion):
+def add_still_drift(
+    rate: Floats, drift: Floats, edge_nodes: Integers, edge_particle: Numbers, slot_of: Numbers, motion: Floats
+) -> None:
     """rate += drift . motion at the nodes between live and switched-off interior points; see `still_shares`."""
     for i in range(edge_nodes.size):
         a = edge_particle[i]
@@ -507,7 +557,9 @@ def add_still_drift(rate, drift, edge_nodes, edge_particle, slot_of, motion):
 
 
 @jit
-def add_moments(moments, u, listed, node_owner, mass, first_moment):
+def add_moments(
+    moments: Floats, u: Floats, listed: Integers, node_owner: Numbers, mass: Floats, first_moment: Floats
+) -> None:
     """moments[a] += (m_b eta_b, q_b eta_b) over the listed nodes b: V_a and int r eta_a as exact nodal sums."""
     for i in range(listed.size):
         b = listed[i]
@@ -521,14 +573,14 @@ def add_moments(moments, u, listed, node_owner, mass, first_moment):
 
 
 @jit
-def start(array, values, listed):
+def start(array: Floats, values: Floats, listed: Integers) -> None:
     """array[a] = values[a] at the listed nodes."""
     for i in range(listed.size):
         array[listed[i]] = values[listed[i]]
 
 
 @jit
-def clear(array, listed):
+def clear(array: Floats, listed: Integers) -> None:
     """array[a, :] = 0 at the listed nodes."""
     for i in range(listed.size):
         for column in range(0, array.shape[1], LANES):
@@ -536,7 +588,7 @@ def clear(array, listed):
 
 
 @jit
-def divide(array, mass, listed):
+def divide(array: Floats, mass: Floats, listed: Integers) -> None:
     """array[a, :] /= m_a at the listed nodes."""
     for i in range(listed.size):
         a = listed[i]
@@ -546,7 +598,7 @@ def divide(array, mass, listed):
 
 
 @jit
-def advance(new, old, dt, rate, listed):
+def advance(new: Floats, old: Floats, dt: float, rate: Floats, listed: Integers) -> None:
     """new = old + dt rate at the listed nodes."""
     for i in range(listed.size):
         a = listed[i]
@@ -555,8 +607,10 @@ def advance(new, old, dt, rate, listed):
 
 
 @jit
-def largest_change(u, reference, watched, watch, eps_rho, eps_eta):
-    """max |u - reference| / eps over the watched nodes and the fields that are watched there."""
+def largest_change(
+    u: Floats, reference: Floats, watched: Integers, watch: Integers, eps_rho: float, eps_eta: float, eps_slot: float
+) -> float:
+    """max |u - reference| / eps over the watched nodes and fields; eps_slot where only a missing slot is watched."""
     largest = 0.0
     for i in range(watched.size):
         a = watched[i]
@@ -564,24 +618,28 @@ def largest_change(u, reference, watched, watch, eps_rho, eps_eta):
         if bits & 1:
             largest = max(largest, abs(u[a, 0] - reference[a, 0]) / eps_rho)
         for c in range(1, u.shape[1]):
-            if bits & 1 or bits & (np.int64(1) << c):
+            if bits & 1:
                 largest = max(largest, abs(u[a, c] - reference[a, c]) / eps_eta)
+            elif bits & (np.int64(1) << c):
+                largest = max(largest, abs(u[a, c] - reference[a, c]) / eps_slot)
     return largest
 
 
 @jit
-def first_outside(u, listed, low, high):
+def first_outside(u: Floats, listed: Integers, low: float, high: float) -> int:
     """The first listed node with a field outside [low, high] or not a number, or -1."""
     for i in range(listed.size):
         a = listed[i]
         for c in range(u.shape[1]):
             if not (low <= u[a, c] <= high):
-                return a
+                return int(a)
     return -1
 
 
 @jit
-def chebyshev_stage(new, old, before, last, rate, rate_0, c, listed):
+def chebyshev_stage(
+    new: Floats, old: Floats, before: Floats, last: Floats, rate: Floats, rate_0: Floats, c: Floats, listed: Integers
+) -> None:
     """new = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0 at the listed nodes."""
     for i in range(listed.size):
         a = listed[i]
@@ -591,7 +649,10 @@ def chebyshev_stage(new, old, before, last, rate, rate_0, c, listed):
 
 
 @jit
-def chebyshev_error(new, old, rate_1, rate_0, dt, mass, tolerance, listed):
+def chebyshev_error(
+    new: Floats, old: Floats, rate_1: Floats, rate_0: Floats, dt: float,
+    mass: Floats, tolerance: float, listed: Integers,
+) -> float:
     """sum_a m_a sum_fields (e / (tolerance (1 + |u|)))^2, e = 0.8 (y_n - y_{n+1}) + 0.4 dt (F_n + F_{n+1})."""
     total = 0.0
     for i in range(listed.size):
@@ -606,7 +667,7 @@ def chebyshev_error(new, old, rate_1, rate_0, dt, mass, tolerance, listed):
 
 
 @jit
-def squares(u, listed):
+def squares(u: Floats, listed: Integers) -> float:
     """sum u^2 over the listed nodes and all fields."""
     total = 0.0
     for i in range(listed.size):
@@ -616,7 +677,7 @@ def squares(u, listed):
 
 
 @jit
-def difference(new, a, b, factor, listed):
+def difference(new: Floats, a: Floats, b: Floats, factor: float, listed: Integers) -> None:
     """new = factor (a - b) at the listed nodes."""
     for i in range(listed.size):
         for c in range(new.shape[1]):
@@ -624,7 +685,9 @@ def difference(new, a, b, factor, listed):
 
 
 @jit
-def hermite(new, old, rate_0, u, rate_1, dt, theta, listed):
+def hermite(
+    new: Floats, old: Floats, rate_0: Floats, u: Floats, rate_1: Floats, dt: float, theta: float, listed: Integers
+) -> None:
     """The cubic through (old, rate_0) and (u, rate_1) a step dt apart, at the fraction theta of the step."""
     h00 = (1.0 + 2.0 * theta) * (1.0 - theta) ** 2
     h10 = theta * (1.0 - theta) ** 2 * dt

@@ -1,14 +1,12 @@
 """The neck between two particles: the part of the surface eta_1 = eta_2 that lies inside the solid, rho > 0.5."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .arrays import Floats, Numbers
 from .case import Case
 from .discretisation import shape_table
 from .geometry import Mesh
-
-Floats = NDArray[np.float64]
 
 # Where eta_1 = eta_2 crosses a cell's edges, by the number of its corners (in falling order) with eta_1 > eta_2.
 SECTIONS = {
@@ -27,7 +25,7 @@ class Neck:
         self.case, self.mesh = case, mesh
         self.tree, self.points = cKDTree(mesh.nodes), cKDTree(mesh.points)
         size = np.asarray(case.domain.size)
-        self.wall = ((mesh.nodes <= 0.0) | (mesh.nodes >= size)).any(axis=1)
+        self.wall = np.asarray(((mesh.nodes <= 0.0) | (mesh.nodes >= size)).any(axis=1))
 
     def measure(self, fields: Floats) -> float:
         """Length in nm (2-D) or area in nm^2 (3-D); fields (n, 3) are the nodal rho, eta_1, eta_2.
@@ -42,7 +40,7 @@ class Neck:
         u = self._at_nodes(fields, numbers)
         return section(self.mesh.nodes[cells], u[places.reshape(cells.shape)])
 
-    def _at_nodes(self, fields: Floats, numbers: NDArray[np.int32]) -> Floats:
+    def _at_nodes(self, fields: Floats, numbers: Numbers) -> Floats:
         """The interpolated fields at some nodes; on the walls and for linear functions the nodal values themselves."""
         values = fields[numbers]
         if self.case.shape_functions.kind == "linear" or not numbers.size:
@@ -50,14 +48,18 @@ class Neck:
         inner = ~self.wall[numbers]
         points = self.mesh.nodes[numbers[inner]]
         _, nearest = self.points.query(points)
-        table = shape_table(self.case, points, self.mesh.spacing[nearest], self.mesh.cells[:0], self.mesh.nodes, self.tree)
+        spacing, no_cells = self.mesh.spacing[nearest], self.mesh.cells[:0]
+        table = shape_table(self.case, points, spacing, no_cells, self.mesh.nodes, self.tree)
         entries = fields[table.nodes] * table.entries()[0][:, None]
         values[inner] = np.add.reduceat(entries, table.offsets[:-1], axis=0)
         return values
 
 
 def section(corners: Floats, u: Floats) -> float:
-    """Measure of {u_1 = u_2, u_0 > 1/2} in simplices with linear fields; corners (c, dim + 1, dim), u (c, dim + 1, 3)."""
+    """Measure of {u_1 = u_2, u_0 > 1/2} in simplices with linear fields.
+
+    corners (c, dim + 1, dim), u (c, dim + 1, 3).
+    """
     dim = corners.shape[2]
     gap = u[:, :, 1] - u[:, :, 2]
     order = np.argsort(-gap, axis=1)
@@ -82,8 +84,9 @@ def section(corners: Floats, u: Floats) -> float:
 def extent(points: Floats) -> Floats:
     """Length of segments (c, 2, 2) or area of triangles (c, 3, 3)."""
     if points.shape[1] == 2:
-        return np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
-    return 0.5 * np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1)
+        return np.asarray(np.linalg.norm(points[:, 1] - points[:, 0], axis=1))
+    normals = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    return np.asarray(0.5 * np.linalg.norm(normals, axis=1))
 
 
 def positive_part(f: Floats) -> Floats:

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import kernels
+from .arrays import Floats
 from .case import Case
 from .clip import clip_cells
 from .discretisation import Discretisation, shape_table
@@ -14,8 +14,6 @@ from .neck import Neck
 from .partition import Collector
 from .scheme import Scheme
 from .state import State
-
-Floats = NDArray[np.float64]
 
 
 class Observables:

@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Floats, Numbers
 from .case import Case
 from .checkpoint import replace_durably
 from .geometry import Mesh
 from .partition import Collector, Ranks
 from .state import State
-
-Floats = NDArray[np.float64]
 
 BLOCK = 65_536  # nodes per chunk of a snapshot
 
@@ -84,8 +82,8 @@ class Snapshots:
     """snapshots.zarr, zarr v3: every rank writes the chunks of its block of nodes.
 
     A snapshot becomes visible at once: its chunks are written while the arrays still end before it, then the arrays
-    grow, and last the group's consolidated metadata is replaced. Readers that use it (zarr and xarray do) see the arrays
-    before or after, never between; `time` grows last for all others.
+    grow, and last the group's consolidated metadata is replaced. Readers that use it (zarr and xarray do) see the
+    arrays before or after, never between; `time` grows last for all others.
     """
 
     def __init__(self, directory: Path, case: Case, mesh: Mesh, collector: Collector, fresh: bool) -> None:
@@ -112,17 +110,17 @@ class Snapshots:
     def _publish(self, number: int, time: float) -> None:
         import zarr
 
-        group = zarr.open_group(self.path, mode="r+", use_consolidated=False)
-        if group["time"].shape[0] > number:
+        names = ("rho", "eta_squared", "particle", "time")
+        stored = {name: zarr.open_array(self.path, path=name, mode="r+") for name in names}
+        if stored["time"].shape[0] > number:
             return
         grown(self.path, "time", number + 1)[number] = time
-        for name in ("rho", "eta_squared", "particle", "time"):
-            array = group[name]
+        for array in stored.values():
             array.resize((number + 1, *array.shape[1:]))
         consolidate(self.path)
 
 
-def owners(u: Floats, state: State) -> tuple[NDArray[np.int32], Floats]:
+def owners(u: Floats, state: State) -> tuple[Numbers, Floats]:
     """For each node: the particle with the largest eta where rho >= 1/2, else -1; and sum eta^2."""
     eta = u[:, 1 : 1 + state.owner.shape[1]]
     slot = eta.argmax(axis=1)

@@ -11,14 +11,11 @@ from typing import Any
 
 import mpi4py
 import numpy as np
-from numpy.typing import NDArray
+
+from .arrays import Array, Floats, Integers
 
 mpi4py.rc.threads = False
 from mpi4py import MPI  # noqa: E402  (after the settings above)
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Array = NDArray[Any]
 
 
 class Ranks:

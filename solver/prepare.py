@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .case import Case
-from .discretisation import activity, discretise, ring
+from .discretisation import activity, discretise
 from .geometry import Mesh, make_mesh
 from .integrators import RK2, Chebyshev, Integrator, contact_time, paper_step
 from .partition import Ranks
@@ -18,7 +18,8 @@ def build_mesh(case: Case, ranks: Ranks) -> Mesh:
     """The case's mesh on every rank. A lattice is built by each; a generated or read mesh comes from rank 0."""
     if case.nodes.source == "lattice":
         return make_mesh(case.nodes, case.domain.size)
-    return ranks.from_root(make_mesh(case.nodes, case.domain.size) if ranks.root else None)
+    mesh: Mesh = ranks.from_root(make_mesh(case.nodes, case.domain.size) if ranks.root else None)
+    return mesh
 
 
 def prepare(case: Case, mesh: Mesh, ranks: Ranks, whole: State | None = None) -> tuple[Scheme, State]:
@@ -27,7 +28,7 @@ def prepare(case: Case, mesh: Mesh, ranks: Ranks, whole: State | None = None) ->
     Collective. The division follows the work expected for that state.
     """
     if whole is None:
-        whole = initial_state(case, mesh.nodes, ring(case, mesh))
+        whole = initial_state(case, mesh.nodes)
     eps = min(case.activation.eps_rho, case.activation.eps_eta)
     d = discretise(case, mesh, ranks, activity(mesh, whole.u, eps))
     nodes = d.share.nodes
@@ -37,8 +38,8 @@ def prepare(case: Case, mesh: Mesh, ranks: Ranks, whole: State | None = None) ->
 
 def make_integrator(case: Case, mesh: Mesh, memory: dict[str, float] | None = None) -> Integrator:
     """The integrator that the case asks for; memory: what a checkpoint kept of it."""
-    if case.time.integrator == "adaptive":
-        return Chebyshev(case.time.tolerance, contact_time(shortest_distance(case, mesh), case), memory)
+    if (tolerance := case.time.tolerance) is not None:  # the adaptive integrator has one, rk2 has none
+        return Chebyshev(tolerance, contact_time(shortest_distance(case, mesh), case), memory)
     return RK2(case.time.step or paper_step(shortest_distance(case, mesh), case))
 
 
@@ -51,4 +52,4 @@ def shortest_distance(case: Case, mesh: Mesh) -> float:
     if case.nodes.source == "lattice":
         return float(mesh.spacing.min())
     distance, _ = cKDTree(mesh.nodes).query(mesh.nodes, k=2)
-    return float(np.min(distance[:, 1]))
+    return float(np.min(np.asarray(distance)[:, 1]))

@@ -1,19 +1,18 @@
 """Rigid-body motion: from contact forces and particle moments to velocities   (6)-(11).
 
-Contacts are by far the stiffest part of the model, and the least interesting: within a few hundredths of a time unit the
-particles sit where their forces vanish, and then follow diffusion. `relaxation` keeps that motion and bounds its speed.
+Contacts are by far the stiffest part of the model, and the least interesting: within a few hundredths of a time unit
+the particles sit where their forces vanish, and then follow diffusion. `relaxation` keeps that motion and bounds its
+speed.
 """
 
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import splu
 
+from .arrays import Floats, Integers
 from .energy import Coefficients
-
-Floats = NDArray[np.float64]
 
 SMALLEST_VOLUME = 1e-3  # nm^dim: a particle that has been consumed has no velocity
 
@@ -40,8 +39,8 @@ def torque(r: Floats, F: Floats) -> Floats:
 def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
     """The rigid motion (v, omega) of every particle, v taken at the origin: V_a(r) = v + omega x r.
 
-    forces (particles, dim + rotations): F_a = int b_a and int r x b_a; moments (particles, 1 + dim): V_a = int eta_a and
-    int r eta_a. With r_a = int r eta_a / V_a and T_a = int (r - r_a) x b_a,
+    forces (particles, dim + rotations): F_a = int b_a and int r x b_a; moments (particles, 1 + dim): V_a = int eta_a
+    and int r eta_a. With r_a = int r eta_a / V_a and T_a = int (r - r_a) x b_a,
     V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a; the paper's v_a is V_a(r) eta_a.
     """
     dim = moments.shape[1] - 1
@@ -53,12 +52,12 @@ def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
 
 
 def relaxation(
-    stiffness: Floats, pairs: NDArray[np.int64], moments: Floats, m: Coefficients, tau: float
+    stiffness: Floats, pairs: Integers, moments: Floats, m: Coefficients, tau: float
 ) -> Callable[[Floats], Floats]:
     """The map from V = M Q to the V_tau of (I + tau M S) V_tau = M Q.
 
-    M takes forces Q = (F, T) to motions V = (v, omega), `velocities`; S says how forces answer to motion, dQ/dt = -S V. A
-    mode that relaxes at the rate lambda now does at lambda / (1 + tau lambda) < 1 / tau: an implicit Euler step
+    M takes forces Q = (F, T) to motions V = (v, omega), `velocities`; S says how forces answer to motion, dQ/dt = -S V.
+    A mode that relaxes at the rate lambda now does at lambda / (1 + tau lambda) < 1 / tau: an implicit Euler step
     of length tau for the forces. Slow motion keeps its speed, but for a lag of tau.
     stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over the ranks.
     """

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import kernels
+from .arrays import Floats
 from .case import Case
 from .integrators import Integrator
 from .scheme import Scheme
 from .state import State
-
-Floats = NDArray[np.float64]
 
 LOWEST, HIGHEST = -0.5, 1.5  # fields outside these are not physics any more
 SAME_TIME = 1e-9  # of the end: output times nearer than this are one

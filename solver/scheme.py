@@ -7,14 +7,12 @@ Nodes carry rho and eta, material points only integrate (Huang et al. 2023, sect
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import kernels, rigid
 from .active import Active, activate
+from .arrays import Floats
 from .discretisation import Discretisation
 from .state import State
-
-Floats = NDArray[np.float64]
 
 
 class Scheme:
@@ -27,7 +25,7 @@ class Scheme:
         self.activate(state)
 
     def activate(self, state: State) -> None:
-        """Choose the live points and the slots for this state (it may move slots), and fit the work arrays. Collective."""
+        """Choose the live points and slots for this state (it may move slots), and fit the work arrays. Collective."""
         self.active: Active = activate(self.d, state)
         points = self.active.live.size
         self.slot_of, self.node_owner = state.slot_of, state.owner
@@ -61,7 +59,8 @@ class Scheme:
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
         kernels.clear(rate, a.nodes)
         kernels.divergence(
-            rate, self.point, self.D, self.S2, self.W, self.motion, self.velocity, a.live, a.owner, a.present, d.weights, d.x,
+            rate, self.point, self.D, self.S2, self.W, self.motion, self.velocity,
+            a.live, a.owner, a.present, d.weights, d.x,
             table.offsets, table.nodes, table.rows, table.table, self.work, m, moving, d.huang,
         )
         if moving:
@@ -78,7 +77,8 @@ class Scheme:
         stiffness = np.zeros((len(a.pairs), 2, *2 * self.motion.shape[1:]))
         keys = a.pairs[:, 0] * self.particles + a.pairs[:, 1]
         kernels.contact_stiffness(
-            stiffness, keys, self.point, a.live, a.owner, a.several, d.weights, d.x, self.particles, d.coefficients, d.huang
+            stiffness, keys, self.point, a.live, a.owner, a.several, d.weights, d.x,
+            self.particles, d.coefficients, d.huang,
         )
         _, moments = self._bodies(u)
         self.relax = rigid.relaxation(d.share.ranks.sum(stiffness), a.pairs, moments, d.coefficients, tau)

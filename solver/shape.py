@@ -8,15 +8,11 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .arrays import Codes, Floats, Integers, Numbers
 from .jit import jit
 from .simd import LANES
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Numbers = NDArray[np.int32]
 
 CHUNK = 65_536  # points whose neighbours are held as Python lists at one time
 CONVERGED = 1e-13  # |sum N (x - x_a)| / h; the consistency of the table is this times h
@@ -33,9 +29,9 @@ class ShapeError(ValueError):
 class ShapeTable:
     """Who sees whom: point p sees nodes[offsets[p] + i], i < offsets[p + 1] - offsets[p].
 
-    Its shape functions are table[:, rows[p] + i] = (N, grad N), grad N in 1/nm. Points that see the same pattern of nodes,
-    as nearly all of a lattice do, share their rows: the table stays in the processor's cache. Rows start at multiples of
-    LANES, and zeros fill them up, so that loops may run over whole packs.
+    Its shape functions are table[:, rows[p] + i] = (N, grad N), grad N in 1/nm. Points that see the same pattern of
+    nodes, as nearly all of a lattice do, share their rows: the table stays in the processor's cache. Rows start at
+    multiples of LANES, and zeros fill them up, so that loops may run over whole packs.
     offsets (p + 1,), nodes (e,), rows (p,), table (1 + dim, stored).
     """
 
@@ -81,7 +77,7 @@ def pad_rows(offsets: Integers, table: Floats) -> tuple[Integers, Floats]:
 
 def search_range(spacing: Floats, gamma: float, tolerance: float) -> Floats:
     """r = h sqrt(-ln(delta_0) / gamma): where exp(-beta r^2) with beta = gamma / h^2 falls to delta_0; nm."""
-    return spacing * np.sqrt(-np.log(tolerance) / gamma)
+    return np.asarray(spacing * np.sqrt(-np.log(tolerance) / gamma))
 
 
 def linear(points: Floats, cells: Numbers, nodes: Floats) -> ShapeTable:
@@ -134,7 +130,7 @@ def lme(
 
 def _neighbours(
     points: Floats, spacing: Floats, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
-) -> tuple[Integers, Numbers, NDArray[np.uint64]]:
+) -> tuple[Integers, Numbers, Codes]:
     """Numbers of neighbours, the neighbours, and a key for each point's pattern; see `arrange`."""
     counts, near, keys = [], [], np.empty(len(points), dtype=np.uint64)
     for first in range(0, len(points), CHUNK):
@@ -184,7 +180,9 @@ def _repair(
 
 
 @jit
-def arrange(near, keys, points, spacing, nodes, offsets):
+def arrange(
+    near: Numbers, keys: Codes, points: Floats, spacing: Floats, nodes: Floats, offsets: Integers
+) -> None:
     """Order each point's neighbours by their displacement in units of h, and give equal patterns equal keys.
 
     Displacements count as equal within 2^-30 h. Both order and key come from a hash: only equality matters.
@@ -215,7 +213,7 @@ def arrange(near, keys, points, spacing, nodes, offsets):
 
 
 @jit
-def mix(h, value):
+def mix(h: np.uint64, value: np.uint64) -> np.uint64:
     """A 64-bit hash of h and value, by multiplication and shifts."""
     h = (h ^ value) * np.uint64(0x9E3779B97F4A7C15)
     h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -223,7 +221,10 @@ def mix(h, value):
 
 
 @jit
-def solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma):
+def solve_lme(
+    table: Floats, residual: Floats, points: Floats, spacing: Floats, nodes: Floats,
+    offsets: Integers, near: Numbers, gamma: float,
+) -> None:
     """Fill table (1 + dim, e) and residual (p,) = |sum N (x - x_a)| / h; infinity where Newton did not converge.
 
     Newton on the convex log Z(lambda), with step halving where log Z would grow, in units of h.
@@ -290,8 +291,10 @@ def solve_lme(table, residual, points, spacing, nodes, offsets, near, gamma):
 
 
 @jit
-def sum_up(weight, r, J, d, count, multiplier, gamma):
-    """weight = N_a, r = sum N d, J = sum N d d^T - r r^T (the Hessian of log Z) and, returned, log Z; d in units of h."""
+def sum_up(
+    weight: Floats, r: Floats, J: Floats, d: Floats, count: int, multiplier: Floats, gamma: float
+) -> float:
+    """weight = N_a, r = sum N d, J = sum N d d^T - r r^T (Hessian of log Z) and, returned, log Z; d in units of h."""
     dim = d.shape[1]
     largest = -np.inf
     for i in range(count):
@@ -316,20 +319,20 @@ def sum_up(weight, r, J, d, count, multiplier, gamma):
         for q in range(k + 1):
             J[k, q] -= r[k] * r[q]
             J[q, k] = J[k, q]
-    return np.log(Z) + largest
+    return float(np.log(Z) + largest)
 
 
 @jit
-def norm(r):
+def norm(r: Floats) -> float:
     """|r|."""
     square = 0.0
     for k in range(r.size):
         square += r[k] * r[k]
-    return np.sqrt(square)
+    return float(np.sqrt(square))
 
 
 @jit
-def invert(inverse, J):
+def invert(inverse: Floats, J: Floats) -> bool:
     """The inverse of a symmetric positive 2 x 2 or 3 x 3 matrix; False where its determinant is not positive."""
     if J.shape[0] == 2:
         det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]

@@ -3,18 +3,19 @@
 numba has no vector type, and its optimiser does not find the one that frit's layout is made for: rho and seven order
 parameters of a node are eight neighbouring doubles. A pack maps to LLVM's `<8 x double>`: one AVX-512 register, or two
 AVX2 registers on older processors. Inside `@jit` functions `load`, `store` and `splat` move packs, + - * work on them
-and with floats, so that a formula written for a float also serves a pack, and `total`, `first`, `with_first` and `positive`
-do what their names say.
+and with floats, so that a formula written for a float also serves a pack, and `total`, `first`, `with_first` and
+`positive` do what their names say.
 """
 
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, cast
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
+
+from .arrays import Floats
 
 LANES = 8
 DOUBLE = ir.DoubleType()
@@ -33,11 +34,11 @@ pack = PackType()
 
 
 @register_model(PackType)
-class PackModel(models.PrimitiveModel):  # type: ignore[misc]
+class PackModel(models.PrimitiveModel):
     """A pack is an LLVM vector."""
 
     def __init__(self, manager: Any, frit_type: PackType) -> None:
-        super().__init__(manager, frit_type, VECTOR)
+        super().__init__(manager, frit_type, VECTOR)  # type: ignore[no-untyped-call]  # numba's is not annotated
 
 
 def _index(lane: int) -> Any:
@@ -54,13 +55,13 @@ def _broadcast(builder: Any, scalar: Any) -> Any:
 def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, column: Any) -> Any:
     """Address of array[row, column ... column + LANES - 1] in a C-contiguous 2-D array of doubles."""
     struct = context.make_array(array_type)(context, builder, array)
-    width = cgutils.unpack_tuple(builder, struct.shape, 2)[1]
+    width = builder.extract_value(struct.shape, 1)
     element = builder.gep(struct.data, [builder.add(builder.mul(row, width), column)])
     return builder.bitcast(element, VECTOR.as_pointer())
 
 
 @intrinsic
-def load(typing: Any, array: Any, row: Any, column: Any) -> Any:
+def _load(typing: Any, array: Any, row: Any, column: Any) -> Any:
     """load(array, row, column): the pack array[row, column : column + LANES]; no bounds are checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -72,7 +73,7 @@ def load(typing: Any, array: Any, row: Any, column: Any) -> Any:
 
 
 @intrinsic
-def store(typing: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
+def _store(typing: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
     """store(array, row, column, pack): write array[row, column : column + LANES]; no bounds are checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -84,7 +85,7 @@ def store(typing: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
 
 
 @intrinsic
-def splat(typing: Any, scalar: Any) -> Any:
+def _splat(typing: Any, scalar: Any) -> Any:
     """splat(x): the pack with x in every lane."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -94,7 +95,7 @@ def splat(typing: Any, scalar: Any) -> Any:
 
 
 @intrinsic
-def first(typing: Any, value: Any) -> Any:
+def _first(typing: Any, value: Any) -> Any:
     """first(pack): lane 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -104,7 +105,7 @@ def first(typing: Any, value: Any) -> Any:
 
 
 @intrinsic
-def with_first(typing: Any, value: Any, scalar: Any) -> Any:
+def _with_first(typing: Any, value: Any, scalar: Any) -> Any:
     """with_first(pack, x): the pack with x in lane 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -114,7 +115,7 @@ def with_first(typing: Any, value: Any, scalar: Any) -> Any:
 
 
 @intrinsic
-def total(typing: Any, value: Any) -> Any:
+def _total(typing: Any, value: Any) -> Any:
     """total(pack): the sum of the lanes, by halves."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -132,7 +133,7 @@ def total(typing: Any, value: Any) -> Any:
 
 
 @intrinsic
-def positive(typing: Any, value: Any) -> Any:
+def _positive(typing: Any, value: Any) -> Any:
     """positive(pack): max(x, 0) in every lane."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -140,6 +141,27 @@ def positive(typing: Any, value: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", arguments[0], zero), arguments[0], zero)
 
     return pack(pack), generate
+
+
+class Pack(Protocol):
+    """A pack as kernels see it: for type checkers alone, which know neither `PackType` nor `_overload`."""
+
+    def __add__(self, other: "Pack | float", /) -> "Pack": ...
+    def __radd__(self, other: float, /) -> "Pack": ...
+    def __sub__(self, other: "Pack | float", /) -> "Pack": ...
+    def __rsub__(self, other: float, /) -> "Pack": ...
+    def __mul__(self, other: "Pack | float", /) -> "Pack": ...
+    def __rmul__(self, other: float, /) -> "Pack": ...
+
+
+# To a type checker an intrinsic is what it is in Python, where a call raises; to kernels it is a function.
+load = cast(Callable[[Floats, int, int], Pack], _load)
+store = cast(Callable[[Floats, int, int, Pack], None], _store)
+splat = cast(Callable[[float], Pack], _splat)
+first = cast(Callable[[Pack], float], _first)
+with_first = cast(Callable[[Pack, float], Pack], _with_first)
+total = cast(Callable[[Pack], float], _total)
+positive = cast(Callable[[Pack], Pack], _positive)
 
 
 def _lanewise(instruction: str) -> Any:

@@ -6,13 +6,9 @@ gets another slot, and when no slot is free another one is made: nothing is ever
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Floats, Integers, Numbers
 from .jit import jit
-
-Numbers = NDArray[np.int32]
-Pairs = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 MOST_SLOTS = 62  # bits of a watch word; see `kernels.watch_nodes`
 
@@ -21,13 +17,13 @@ class SlotError(RuntimeError):
     """More particles meet at one place than frit has slots."""
 
 
-def unique_pairs(pairs: Pairs) -> Pairs:
+def unique_pairs(pairs: Integers) -> Integers:
     """The distinct rows (a, b) with a < b, sorted; (pairs, 2)."""
     ordered = np.sort(pairs.reshape(-1, 2), axis=1)
     return np.unique(ordered[(ordered[:, 0] >= 0) & (ordered[:, 0] < ordered[:, 1])], axis=0)
 
 
-def colour(pairs: Pairs, particles: int) -> Numbers:
+def colour(pairs: Integers, particles: int) -> Numbers:
     """A slot for every particle so that the particles of a pair differ; largest degree first, lowest slot free."""
     meets = _adjacency(pairs, particles)
     slot_of = np.full(particles, -1, dtype=np.int32)
@@ -36,7 +32,7 @@ def colour(pairs: Pairs, particles: int) -> Numbers:
     return slot_of
 
 
-def recolour(slot_of: Numbers, pairs: Pairs) -> Numbers:
+def recolour(slot_of: Numbers, pairs: Integers) -> Numbers:
     """New slots in which no pair shares one; only particles that clash move, the one with fewer neighbours first."""
     meets = _adjacency(pairs, len(slot_of))
     new = slot_of.copy()
@@ -47,7 +43,7 @@ def recolour(slot_of: Numbers, pairs: Pairs) -> Numbers:
     return new
 
 
-def _adjacency(pairs: Pairs, particles: int) -> list[list[int]]:
+def _adjacency(pairs: Integers, particles: int) -> list[list[int]]:
     meets: list[list[int]] = [[] for _ in range(particles)]
     for a, b in pairs.tolist():
         meets[a].append(b)
@@ -72,7 +68,7 @@ def repack(u: Floats, owner: Numbers, slot_of: Numbers, columns: int) -> tuple[F
 
 
 @jit
-def move(new_u, new_owner, u, owner, slot_of):
+def move(new_u: Floats, new_owner: Numbers, u: Floats, owner: Numbers, slot_of: Numbers) -> None:
     """Copy rho, and every owned eta into the slot of its owner."""
     for a in range(u.shape[0]):
         new_u[a, 0] = u[a, 0]
@@ -83,7 +79,7 @@ def move(new_u, new_owner, u, owner, slot_of):
 
 
 @jit
-def meeting(owner, chosen):
+def meeting(owner: Numbers, chosen: Integers) -> Integers:
     """Every pair of particles that one of the chosen rows of owner holds together, once: (pairs, 2)."""
     seen = {np.int64(-1)}
     for p in chosen:

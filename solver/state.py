@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .arrays import Floats, Integers, Numbers
 from .case import Case
 from .simd import LANES
 from .slots import colour
-
-Floats = NDArray[np.float64]
-Numbers = NDArray[np.int32]
 
 TAIL = 1e-16  # rho = sum eta_a counts order parameters down to this value
 
@@ -58,9 +55,9 @@ def surface_distance(case: Case, particle: int, x: Floats) -> Floats:
     given = case.particles
     r = x - np.asarray(given.centres[particle])
     if given.shape == "sphere":
-        return np.linalg.norm(r, axis=1) - given.radii[particle]
+        return np.asarray(np.linalg.norm(r, axis=1) - given.radii[particle])
     beyond = np.abs(r) - 0.5 * np.asarray(given.sizes[particle])
-    return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
 
 
 def reach(case: Case) -> Floats:
@@ -68,20 +65,20 @@ def reach(case: Case) -> Floats:
     given = case.particles
     if given.shape == "sphere":
         return np.asarray(given.radii, dtype=float)
-    return 0.5 * np.linalg.norm(np.asarray(given.sizes, dtype=float), axis=1)
+    return np.asarray(0.5 * np.linalg.norm(np.asarray(given.sizes, dtype=float), axis=1))
 
 
-def initial_state(case: Case, nodes: Floats, ring: float) -> State:
+def initial_state(case: Case, nodes: Floats) -> State:
     """The fields (34) on the given nodes (n, dim): rho = min(sum eta, 1), and eta_a where it is at least eps_eta.
 
-    ring: how far one evaluation can carry a value, nm; particles nearer than that do not share a slot.
+    Particles whose kept parts overlap do not share a slot; `active.activate` separates those that are merely close.
     """
     few = case.activation.few_order_parameters
     xi, radii = case.particles.interface_width, reach(case)
     centres = np.asarray(case.particles.centres)
     cut = case.activation.eps_eta
     extent = radii + 0.5 * xi * np.log(1.0 / cut)
-    slot_of = colour(_neighbours(centres, extent + ring), len(radii)) if few else np.arange(len(radii), dtype=np.int32)
+    slot_of = colour(_neighbours(centres, extent), len(radii)) if few else np.arange(len(radii), dtype=np.int32)
     slots = int(slot_of.max()) + 1
     u = np.zeros((len(nodes), width(slots)))
     owner = np.full((len(nodes), slots), -1, dtype=np.int32)
@@ -97,9 +94,9 @@ def initial_state(case: Case, nodes: Floats, ring: float) -> State:
     return State(0.0, 0, 0, u, owner, slot_of)
 
 
-def _neighbours(centres: Floats, reaches: Floats) -> NDArray[np.int64]:
+def _neighbours(centres: Floats, reaches: Floats) -> Integers:
     """Pairs (a, b), a < b, of particles whose balls of the given radii overlap; (pairs, 2)."""
     tree = cKDTree(centres)
     pairs = tree.query_pairs(2.0 * float(reaches.max()), output_type="ndarray").astype(np.int64)
     gap = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
-    return pairs[gap < reaches[pairs[:, 0]] + reaches[pairs[:, 1]]]
+    return np.asarray(pairs[gap < reaches[pairs[:, 0]] + reaches[pairs[:, 1]]])

@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from frit.solver.arrays import Array, Floats, Integers
 
 if TYPE_CHECKING:
     import zarr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from scipy.spatial import cKDTree
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Paul Tol's light scheme: told apart with any colour vision, and dark lines show on all of it.
 PALETTE = ("#77aadd", "#ee8866", "#eedd88", "#44bb99", "#ffaabb", "#bbcc33", "#99ddff", "#aaaa00")
@@ -43,7 +41,7 @@ class PlotError(ValueError):
 # --- history --------------------------------------------------------------------------------------------
 
 
-def read_history(directory: Path) -> dict[str, NDArray[Any]]:
+def read_history(directory: Path) -> dict[str, Array]:
     """The scalar columns of history.jsonl, NaN where a row has none; a torn last line is left out."""
     path = directory / "history.jsonl"
     lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []  # a whole line ends with a newline
@@ -93,8 +91,8 @@ class Snapshot:
     nodes: Floats
     rho: Floats
     eta_squared: Floats
-    owner: Ints
-    first_owner: Ints
+    owner: Integers
+    first_owner: Integers
 
 
 def nearest_time(directory: Path, time: float) -> float:
@@ -141,7 +139,7 @@ def plot_snapshot(directory: Path, time: float, out: Path) -> float:
     return snapshot.time
 
 
-def particle_colours(nodes: Floats, owner: Ints, last: int = 0) -> Floats:
+def particle_colours(nodes: Floats, owner: Integers, last: int = 0) -> Floats:
     """Red, green, blue per particle (rows to `last` at least), grey for owner -1.
 
     Largest first, each takes the colour whose nearest holder is farthest away: those that can touch differ.
@@ -164,7 +162,7 @@ def particle_colours(nodes: Floats, owner: Ints, last: int = 0) -> Floats:
     return palette[[*chosen, len(PALETTE)]]
 
 
-def interpolation(tree: "cKDTree", at: Floats) -> tuple[Ints, Floats]:
+def interpolation(tree: "cKDTree", at: Floats) -> tuple[Integers, Floats]:
     """Nodes (p, k) near points (p, dim), and weights by moving least squares: exact for linear fields.
 
     weight_a = w_a P_a . M^-1 (1, 0..), M = sum w P P^T, P = (1, x_a - x), w = (1 - d^2 / reach^2)^2
@@ -202,7 +200,7 @@ def section(
 
 
 def _shade(
-    weight: Floats, rho: Floats, eta_squared: Floats, owner: Ints, colours: Floats
+    weight: Floats, rho: Floats, eta_squared: Floats, owner: Integers, colours: Floats
 ) -> tuple[Floats, Floats]:
     """rho (p,) and colour (p, 3) of pixels from their nodes (p, k): vacancy white, grain boundaries dark.
 

@@ -3,25 +3,23 @@
 from itertools import pairwise, product
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from frit.solver.clip import clip_cells
-from frit.solver.geometry import Mesh, lattice
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, Delaunay, HalfspaceIntersection
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
+from frit.solver.arrays import Floats, Numbers
+from frit.solver.clip import clip_cells
+from frit.solver.geometry import Mesh, lattice
 
 
-def random_mesh(dim: int, count: int, seed: int = 1) -> tuple[Floats, Ints]:
+def random_mesh(dim: int, count: int, seed: int = 1) -> tuple[Floats, Numbers]:
     """Delaunay cells that fill the unit box: its corners and random points inside."""
     inside = np.random.default_rng(seed).random((count, dim))
     nodes = np.concatenate([np.array(list(product((0.0, 1.0), repeat=dim))), inside])
     return nodes, Delaunay(nodes).simplices.astype(np.int32)
 
 
-def own_volumes(nodes: Floats, cells: Ints) -> Floats:
+def own_volumes(nodes: Floats, cells: Numbers) -> Floats:
     edges = nodes[cells[:, 1:]] - nodes[cells[:, :1]]
     return np.asarray(np.abs(np.linalg.det(edges)) / (2.0 if nodes.shape[1] == 2 else 6.0))
 

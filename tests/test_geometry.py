@@ -10,9 +10,11 @@ from typing import Any
 
 import meshio
 import numpy as np
-import numpy.typing as npt
 import pytest
+from scipy.spatial import cKDTree
+
 from frit.solver import geometry
+from frit.solver.arrays import Floats, Integers, Numbers
 from frit.solver.geometry import (
     Mesh,
     MeshError,
@@ -21,10 +23,6 @@ from frit.solver.geometry import (
     lattice,
     make_mesh,
 )
-from scipy.spatial import cKDTree
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 
 INSTALL = "apt-get install libglu1-mesa libgl1 libxrender1 libxcursor1 libxft2 libxinerama1 libgomp1"
 A = 2 / np.sqrt(3)  # cube edge of the body-centred lattice with nearest neighbours at distance 1
@@ -50,7 +48,7 @@ def edge_lengths(mesh: Mesh) -> Floats:
     return np.sort(np.stack([np.linalg.norm(x[:, i] - x[:, j], axis=1) for i, j in pairs], axis=1), axis=1)
 
 
-def facets(mesh: Mesh) -> tuple[Ints, npt.NDArray[np.intp]]:
+def facets(mesh: Mesh) -> tuple[Numbers, Integers]:
     """The facets' sorted nodes and the number of cells that share each."""
     corners = mesh.cells.shape[1]
     sides = [np.delete(mesh.cells, i, axis=1) for i in range(corners)]

@@ -1,0 +1,193 @@
+"""The solver's speed: `make bench`, or `python tests/benchmarks/bench.py [two-discs | shape | start | particles]`.
+
+Every figure is the median of several runs in this process or of several processes, on one core. Machines differ and are
+shared: the ratios count.
+"""
+
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frit.solver.case import Case, parse_case
+from frit.solver.geometry import lattice
+from frit.solver.partition import Ranks
+from frit.solver.prepare import build_mesh, make_integrator, prepare
+from frit.solver.run import run
+from frit.solver.shape import lme
+
+
+class Silent:
+    """An observer that writes nothing: only the solver is timed."""
+
+    def history(self, *_: Any) -> None:
+        """No row."""
+
+    def snapshot(self, *_: Any) -> None:
+        """No snapshot."""
+
+    def after_step(self, *_: Any) -> bool:
+        """Go on."""
+        return False
+
+
+def two_discs(end: float = 10.0, **changes: dict[str, Any]) -> Case:
+    """Two touching discs of radius 20 nm at spacing 1, without rigid motion."""
+    tree: dict[str, Any] = {
+        "domain": {"size": [100.0, 60.0]},
+        "nodes": {"source": "lattice", "spacing": 1.0},
+        "particles": {"source": "list", "centres": [[30.0, 30.0], [70.0, 30.0]], "radii": [20.0, 20.0]},
+        "model": {"rigid_motion": False},
+        "time": {"end": end, "integrator": "rk2"},
+        "output": {"history_every": end, "snapshots": []},
+    }
+    return parse_case({**tree, **changes})
+
+
+def time_loop(case: Case) -> tuple[float, int]:
+    """Processor seconds of the time loop, and evaluations."""
+    mesh = build_mesh(case, Ranks())
+    scheme, state = prepare(case, mesh, Ranks())
+    integrator = make_integrator(case, mesh)
+    began = time.process_time()
+    run(scheme, state, integrator, Silent())
+    return time.process_time() - began, state.evaluations
+
+
+def median(measure: Callable[[], float], runs: int) -> float:
+    """The median of some runs, after one that is not counted."""
+    measure()
+    return statistics.median(measure() for _ in range(runs))
+
+
+def bench_two_discs() -> None:
+    """rk2 at the paper's step to t = 10, and what each choice is worth."""
+    off = {"enabled": False, "few_order_parameters": False}
+    cases = {
+        "rk2, 2000 steps (bar: 10 s)": two_discs(),
+        "  every point live": two_discs(activation=off),
+        "  linear shape functions": two_discs(shape_functions={"kind": "linear"}),
+        "adaptive, tolerance 1e-3": two_discs(time={"end": 10.0, "integrator": "adaptive"}),
+    }
+    print("two discs, spacing 1, t = 10, no rigid motion: processor seconds of the time loop")
+    reference = 0.0
+    for name, case in cases.items():
+        evaluations = 0
+
+        def measure(case: Case = case) -> float:
+            nonlocal evaluations
+            seconds, evaluations = time_loop(case)
+            return seconds
+
+        seconds = median(measure, 3)
+        reference = reference or seconds
+        print(
+            f"  {name:32s} {seconds:7.2f} s  {evaluations:6d} evaluations  {1e3 * seconds / evaluations:6.2f} ms each"
+            f"  ratio to the first {seconds / reference:.3f}"
+        )
+
+
+def bench_shape() -> None:
+    """Shape functions of 128 000 points of 26 nodes."""
+    mesh = lattice((250.0, 219.0), 0.985)
+    jitter = np.random.default_rng(0).uniform(-1e-3, 1e-3, mesh.points.shape)
+    shared = median(lambda: _seconds(lambda: lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)), 5)
+    own = median(lambda: _seconds(lambda: lme(mesh.points + jitter, mesh.spacing, mesh.nodes, 1.8, 1e-6)), 5)
+    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
+    each = table.nodes.size / table.points
+    print(f"shape functions, {table.points} points of {each:.1f} nodes: processor seconds (bar: 2 s)")
+    print(f"  lattice, repeated rows solved once {shared:6.2f} s")
+    print(f"  every point solved by itself       {own:6.2f} s  ratio {own / shared:.2f}")
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    began = time.process_time()
+    work()
+    return time.process_time() - began
+
+
+def bench_start() -> None:
+    """A whole process that runs a short case with a warm cache: what a user waits for before anything moves."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "case.json"
+        path.write_text(two_discs(0.01).resolved_json())
+        launch = [sys.executable, "-P", "-m", "frit.solver", str(path), "--out"]
+        counter = iter(range(100))
+
+        def whole() -> float:
+            began = time.monotonic()
+            subprocess.run([*launch, f"{folder}/{next(counter)}"], check=True)
+            return time.monotonic() - began
+
+        def cold() -> float:
+            environment = {**os.environ, "FRIT_CACHE_DIR": f"{folder}/cache"}
+            began = time.monotonic()
+            subprocess.run([*launch, f"{folder}/cold"], check=True, env=environment)
+            return time.monotonic() - began
+
+        warm = median(whole, 5)
+        print("start, set-up, two steps and all output of the two-disc case in a process of its own: wall seconds")
+        print(f"  warm cache {warm:6.2f} s,  empty cache {cold():6.2f} s")
+
+
+def bench_particles() -> None:
+    """Time per evaluation and memory with 10, 100 and 1000 particles on the same nodes, every point live."""
+    print("10, 100, 1000 discs of radius 5 on the same nodes, every point live (bar: ratios within 1.3)")
+    first: dict[str, float] = {}
+    for count in (10, 100, 1000):
+        output = subprocess.run(
+            [sys.executable, __file__, "particles-one", str(count)], check=True, capture_output=True, text=True
+        )
+        result = json.loads(output.stdout)
+        first = first or result
+        print(
+            f"  {count:5d} particles  {result['nodes']:.0f} nodes  {result['slots']:.0f} slots"
+            f"  {1e3 * result['seconds']:7.2f} ms/step  ratio {result['seconds'] / first['seconds']:.2f}"
+            f"  peak memory {result['memory']:.0f} MB  ratio {result['memory'] / first['memory']:.2f}"
+        )
+
+
+def particles_one(count: int) -> None:
+    """One measurement of `bench_particles`, printed as JSON."""
+    columns, radius = 32, 5.0
+    centres = [
+        [12.0 + 2 * radius * (k % columns) + radius * (k // columns % 2), 12.0 + radius * 3**0.5 * (k // columns)]
+        for k in range(count)
+    ]
+    tree = {
+        "domain": {"size": [340.0, 300.0]},
+        "nodes": {"source": "lattice", "spacing": 1.0},
+        "particles": {"source": "list", "centres": centres, "radii": [radius] * count},
+        "time": {"end": 0.2, "integrator": "adaptive"},
+        "activation": {"enabled": False},
+        "output": {"history_every": 0.2, "snapshots": []},
+    }
+    case = parse_case(tree)
+    mesh = build_mesh(case, Ranks())
+    scheme, state = prepare(case, mesh, Ranks())
+    run(scheme, state, make_integrator(case, mesh), Silent())
+    scheme.activate(state)
+    rate = np.zeros_like(state.u)
+    seconds = median(lambda: _seconds(lambda: [scheme.rates(state.u, rate) for _ in range(5)]) / 5, 7)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    slots = float(state.owner.shape[1])
+    print(json.dumps({"nodes": len(mesh.nodes), "slots": slots, "seconds": seconds, "memory": memory}))
+
+
+BENCHES = {"two-discs": bench_two_discs, "shape": bench_shape, "start": bench_start, "particles": bench_particles}
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["particles-one"]:
+        particles_one(int(sys.argv[2]))
+    else:
+        for chosen in sys.argv[1:] or BENCHES:
+            BENCHES[chosen]()

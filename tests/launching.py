@@ -1,0 +1,203 @@
+"""The real solver under the real mpirun: tiny cases, signals, kills, and what a run directory holds.
+
+Processes carry a mark in their environment, so that one which outlives its mpirun is seen. Waiting has no limit but
+`TIMEOUT`, which is there for hangs: nothing is measured by a clock.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+import psutil
+import zarr
+from frit.service.launch import OPEN_MPI, clean_environment, is_open_mpi, mpirun_command, solver_arguments
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Case = Mapping[str, Mapping[str, Any]]
+
+TIMEOUT = 240.0  # seconds
+FIELDS = ("rho", "eta_squared", "particle")
+
+# Two touching discs that are alike in nothing, so that no value is decided by a tie; 100 steps.
+PAIR: Case = {
+    "domain": {"size": [22.0, 13.0]},
+    "nodes": {"spacing": 1.0},
+    "particles": {"centres": [[6.5, 6.2], [15.4, 6.8]], "radii": [5.0, 4.0]},
+    "time": {"integrator": "rk2", "end": 0.01, "step": 1e-4},
+    "output": {"history_every": 0.001, "snapshots": [0.0, 0.0035, 0.01]},
+}
+
+# The solver with a rest after each step: there is time to reach it with a signal between two rows.
+PATIENT = """
+import sys, time
+from frit.solver import __main__ as solver
+
+after_step = solver.Recorder.after_step
+
+def rest(*arguments):
+    time.sleep(0.01)
+    return after_step(*arguments)
+
+solver.Recorder.after_step = rest
+sys.exit(solver.main())
+"""
+
+
+class Tree:
+    """An mpirun and all that it starts; leaving the `with` block kills what is left."""
+
+    def __init__(self, ranks: int, *arguments: str | Path, script: str | None = None) -> None:
+        """script: Python source to run in the place of `-m frit.solver`."""
+        program = solver_arguments() if script is None else [sys.executable, "-P", "-c", script]
+        command = mpirun_command(ranks, [])[: -len(solver_arguments())] + program
+        environment = (OPEN_MPI if is_open_mpi(command[0]) else {}) | clean_environment(os.environ)
+        self.mark = uuid.uuid4().hex
+        self.process = subprocess.Popen(
+            [*command, *map(str, arguments)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment | {"FRIT_TEST_MARK": self.mark},
+            start_new_session=True,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+        if self.process.stdout:
+            self.process.stdout.close()
+
+    def ended(self) -> tuple[int, str]:
+        """The exit status of mpirun and all that was printed, once it has ended."""
+        printed, _ = self.process.communicate(timeout=TIMEOUT)
+        return self.process.returncode, printed
+
+    def alive(self) -> list[int]:
+        """Processes that carry the mark; a zombie carries nothing."""
+        found = []
+        for process in psutil.process_iter():
+            with suppress(psutil.Error):
+                if process.environ().get("FRIT_TEST_MARK") == self.mark:
+                    found.append(process.pid)
+        return found
+
+    def kill(self) -> None:
+        """kill -9, until nobody is left who could start another."""
+        while pids := self.alive():
+            for pid in pids:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        self.process.wait(TIMEOUT)
+
+    def until(self, happened: Callable[[], bool]) -> None:
+        """Wait while it runs; an end before that is an error."""
+        deadline = time.monotonic() + TIMEOUT
+        while not happened():
+            assert self.process.poll() is None, f"ended before: {self.ended()}"
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+
+def write_case(directory: Path, case: Case) -> Path:
+    """As a JSON file beside the run directory."""
+    path = directory.with_suffix(".json")
+    path.write_text(json.dumps(case))
+    return path
+
+
+def launch(case: Case, directory: Path, ranks: int = 1, script: str | None = None) -> Tree:
+    """A fresh run."""
+    return Tree(ranks, write_case(directory, case), "--out", directory, script=script)
+
+
+def solve(case: Case, directory: Path, ranks: int = 1, script: str | None = None) -> Path:
+    """Run to the end, which must be a good one."""
+    with launch(case, directory, ranks, script) as tree:
+        finish(tree, directory)
+    return directory
+
+
+def resume(directory: Path, ranks: int = 1) -> Path:
+    """Go on to the end, which must be a good one."""
+    with Tree(ranks, "--resume", directory) as tree:
+        finish(tree, directory)
+    return directory
+
+
+def finish(tree: Tree, directory: Path) -> None:
+    """Wait for a good end."""
+    status, printed = tree.ended()
+    assert status == 0, printed
+    assert record(directory)["state"] == "done"
+
+
+# --- what a run directory holds
+
+
+def record(directory: Path) -> dict[str, Any]:
+    """run.json; empty before it is there."""
+    path = directory / "run.json"
+    return dict(json.loads(path.read_text())) if path.exists() else {}
+
+
+def history(directory: Path) -> list[dict[str, Any]]:
+    """The complete rows so far."""
+    path = directory / "history.jsonl"
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def columns(directory: Path) -> dict[str, Array]:
+    """The history but for wall_time, by column; None becomes NaN."""
+    rows = history(directory)
+    return {key: np.array([row[key] for row in rows], dtype=float) for key in rows[0] if key != "wall_time"}
+
+
+def final_fields(directory: Path) -> dict[str, Array]:
+    """The nodal fields of checkpoint.h5."""
+    with h5py.File(directory / "checkpoint.h5") as file:
+        return {name: np.asarray(file[name]) for name in ("u", "owner", "slot_of")}
+
+
+def snapshots(directory: Path) -> dict[str, Array]:
+    """All arrays of snapshots.zarr as a reader sees them."""
+    group = zarr.open_group(directory / "snapshots.zarr", mode="r")
+    return {name: np.asarray(array) for name, array in group.arrays()}
+
+
+def different(a: Path, b: Path, tolerance: float) -> dict[str, float]:
+    """What differs by more than the tolerance between two runs: the largest difference over the largest value.
+
+    Columns of the history but for wall_time, fields of the checkpoint, arrays of the snapshots.
+    """
+    found = {}
+    for read in (columns, final_fields, snapshots):
+        left, right = read(a), read(b)
+        assert left.keys() == right.keys()
+        for name in left:
+            if (change := relative(left[name], right[name])) > tolerance:
+                found[f"{read.__name__} {name}"] = change
+    return found
+
+
+def relative(a: Array, b: Array) -> float:
+    """max |a - b| / max |a|; infinite where the shapes or the missing values differ."""
+    if a.shape != b.shape or not np.array_equal(np.isnan(a), np.isnan(b)):
+        return np.inf
+    known = ~np.isnan(a)
+    scale = np.abs(a[known]).max(initial=0.0)
+    return float(np.abs(a[known].astype(float) - b[known]).max(initial=0.0) / (scale or 1.0))

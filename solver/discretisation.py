@@ -81,9 +81,12 @@ def _moments(table: ShapeTable, weights: Floats, x: Floats, nodes: int) -> tuple
     """This rank's parts of m_a and q_a."""
     counts = np.diff(table.offsets)
     wN = np.repeat(weights, counts) * table.entries()[0]
-    shares = [wN, *(wN * np.repeat(x[:, k], counts) for k in range(x.shape[1]))]
-    mass, *moment = (np.asarray(np.bincount(table.nodes, share, nodes), dtype=np.float64) for share in shares)
-    return mass, np.stack(moment, axis=1)
+
+    def at_nodes(shares: Floats) -> Floats:
+        return np.asarray(np.bincount(table.nodes, shares, nodes), dtype=np.float64)
+
+    moment = [at_nodes(wN * np.repeat(x[:, k], counts)) for k in range(x.shape[1])]
+    return at_nodes(wN), np.stack(moment, axis=1)
 
 
 def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:

@@ -26,6 +26,7 @@ class Scheme:
 
     def activate(self, state: State) -> None:
         """Choose the live points and slots for this state (it may move slots), and fit the work arrays. Collective."""
+        self.point = np.empty((0, 0))  # free the largest array before the next one is made
         self.active: Active = activate(self.d, state)
         points = self.active.live.size
         self.slot_of, self.node_owner = state.slot_of, state.owner

@@ -5,6 +5,8 @@ both. That is a colouring of the graph of particles that meet. When two particle
 gets another slot, and when no slot is free another one is made: nothing is ever dropped.
 """
 
+from heapq import heapify, heappop, heappush
+
 import numpy as np
 
 from .arrays import Floats, Integers, Numbers
@@ -24,11 +26,25 @@ def unique_pairs(pairs: Integers) -> Integers:
 
 
 def colour(pairs: Integers, particles: int) -> Numbers:
-    """A slot for every particle so that the particles of a pair differ; largest degree first, lowest slot free."""
+    """A slot for every particle so that the particles of a pair differ, and few slots in all.
+
+    The particle whose neighbours already use the most slots comes next, and takes the lowest slot free (Brelaz 1979).
+    """
     meets = _adjacency(pairs, particles)
     slot_of = np.full(particles, -1, dtype=np.int32)
-    for a in sorted(range(particles), key=lambda a: (-len(meets[a]), a)):
-        slot_of[a] = _lowest_free(slot_of, meets[a])
+    taken: list[set[int]] = [set() for _ in range(particles)]
+    queue = [(0, -len(meets[a]), a) for a in range(particles)]
+    heapify(queue)
+    while queue:
+        saturation, _, a = heappop(queue)
+        if slot_of[a] >= 0 or -saturation < len(taken[a]):
+            continue  # has a slot, or an entry with more used slots is in the queue
+        slot = _lowest_free(taken[a])
+        slot_of[a] = slot
+        for b in meets[a]:
+            if slot_of[b] < 0 and slot not in taken[b]:
+                taken[b].add(slot)
+                heappush(queue, (-len(taken[b]), -len(meets[b]), b))
     return slot_of
 
 
@@ -39,7 +55,7 @@ def recolour(slot_of: Numbers, pairs: Integers) -> Numbers:
     for a, b in pairs[slot_of[pairs[:, 0]] == slot_of[pairs[:, 1]]]:
         if new[a] == new[b]:
             moved = min((a, b), key=lambda c: (len(meets[c]), c))
-            new[moved] = _lowest_free(new, meets[moved])
+            new[moved] = _lowest_free({int(new[c]) for c in meets[moved]})
     return new
 
 
@@ -51,8 +67,7 @@ def _adjacency(pairs: Integers, particles: int) -> list[list[int]]:
     return meets
 
 
-def _lowest_free(slot_of: Numbers, neighbours: list[int]) -> int:
-    taken = {int(slot_of[b]) for b in neighbours}
+def _lowest_free(taken: set[int]) -> int:
     free = next(s for s in range(len(taken) + 1) if s not in taken)
     if free >= MOST_SLOTS:
         raise SlotError(f"{free + 1} particles meet at one place, at most {MOST_SLOTS} can")

@@ -9,8 +9,9 @@ import zarr
 from matplotlib.image import imread
 from scipy.spatial import cKDTree
 
+from frit.solver.arrays import Floats
 from frit.sweeps import plots
-from frit.sweeps.plots import Floats, PlotError
+from frit.sweeps.plots import PlotError
 
 SIZE = [60.0, 36.0]
 CENTRES = np.array([[18.0, 18.0], [42.0, 18.0]])

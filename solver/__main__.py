@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from . import checkpoint, output
+from . import checkpoint, output, slots
 from .arrays import Floats
 from .case import Case, CaseError, load_case
 from .checkpoint import CheckpointError
 from .geometry import Mesh, MeshError
-from .integrators import Integrator
+from .integrators import RELAX_EVERY, Chebyshev, Integrator
 from .observe import Observables
 from .partition import Collector, Ranks, mpi_library
 from .prepare import build_mesh, make_integrator, prepare
@@ -39,11 +39,11 @@ EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 def main() -> int:
     """Run; any exception on one rank is written down and ends all ranks."""
-    arguments = parser().parse_args()
-    ranks = Ranks.world()
+    arguments = read_arguments()
+    requests, ranks = Requests(), Ranks.world()
     directory = Path(arguments.resume or arguments.out)
     try:
-        state, message = execute(arguments, ranks, directory)
+        state, message = execute(arguments, ranks, directory, requests)
     except BaseException as error:
         return give_up(error, ranks, directory)
     if ranks.root:
@@ -51,30 +51,50 @@ def main() -> int:
     return EXIT_STATUS[state]
 
 
-def parser() -> argparse.ArgumentParser:
+def read_arguments() -> argparse.Namespace:
     """The command line."""
-    result = argparse.ArgumentParser(prog="frit.solver", description="Run one case under MPI.")
-    result.add_argument("case", nargs="?", help="case file (TOML or JSON)")
-    result.add_argument("--out", help="run directory to make")
-    result.add_argument("--resume", metavar="DIR", help="run directory to go on with")
-    result.add_argument("--progress", action="store_true", help="print progress as JSON lines")
-    return result
+    parser = argparse.ArgumentParser(prog="frit.solver", description="Run one case under MPI.")
+    parser.add_argument("case", nargs="?", help="case file (TOML or JSON)")
+    parser.add_argument("--out", help="run directory to make")
+    parser.add_argument("--resume", metavar="DIR", help="run directory to go on with")
+    parser.add_argument("--progress", action="store_true", help="print progress as JSON lines")
+    arguments = parser.parse_args()
+    if len({arguments.resume is None, arguments.case is not None, arguments.out is not None}) > 1:
+        parser.error("give either CASE --out DIR or --resume DIR")
+    return arguments
 
 
-def execute(arguments: argparse.Namespace, ranks: Ranks, directory: Path) -> tuple[str, str | None]:
+class Requests:
+    """What signals have asked for: a checkpoint (USR1), or the end (TERM, INT). Heard from the start of `main`."""
+
+    def __init__(self) -> None:
+        self.checkpoint = self.end = False
+        for number in (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: object) -> None:
+        if number == signal.SIGUSR1:
+            self.checkpoint = True
+        else:
+            self.end = True
+
+
+def execute(
+    arguments: argparse.Namespace, ranks: Ranks, directory: Path, requests: Requests
+) -> tuple[str, str | None]:
     """The whole run: how it ended, and a message where it did not end well."""
     fresh = arguments.resume is None
-    if fresh == (arguments.case is None) or fresh == (arguments.out is None):
-        raise output.DirectoryError("give either CASE --out DIR or --resume DIR")
     case: Case = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
     mesh = build_mesh(case, ranks)
     kept = None if fresh else ranks.from_root(checkpoint.read(directory, case.identity(), mesh) if ranks.root else None)
     scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
     if kept:
-        nodes = scheme.d.share.nodes
-        state.u[:] = kept.state.u[nodes]
+        nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
+        state.u[:], _ = slots.repack(
+            kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1]
+        )
     integrator = make_integrator(case, mesh, kept.memory if kept else None)
-    recorder = Recorder(directory, mesh, scheme, state, kept.wall_time if kept else None, arguments.progress)
+    recorder = Recorder(directory, mesh, scheme, state, kept.wall_time if kept else None, requests, arguments.progress)
     try:
         finished = run(scheme, state, integrator, recorder)
         recorder.checkpoint(scheme, state, integrator)
@@ -86,18 +106,21 @@ def execute(arguments: argparse.Namespace, ranks: Ranks, directory: Path) -> tup
 
 
 def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:
-    """Rank 0: lock the run directory, and write or read its case."""
-    if arguments.resume:
-        if not (directory / checkpoint.NAME).exists():
-            raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from")
-        output.lock(directory)
+    """Rank 0: lock the run directory, and write or read its case. Whoever has not the lock writes nothing there."""
+    fresh = arguments.resume is None
+    if fresh:
+        directory.mkdir(parents=True, exist_ok=True)
+    elif not directory.is_dir():
+        raise output.DirectoryError(f"{directory}: no such folder")
+    output.lock(directory)
+    if (directory / checkpoint.NAME).exists() == fresh:
+        if fresh:
+            raise output.DirectoryError(f"{directory}: holds a run already; go on with --resume")
+        raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from")
+    if not fresh:
         return load_case(directory / "case.json")
     case = load_case(arguments.case)
-    directory.mkdir(parents=True, exist_ok=True)
-    output.lock(directory)
-    if (directory / checkpoint.NAME).exists():
-        raise output.DirectoryError(f"{directory}: holds a run already; go on with --resume")
-    (directory / "case.json").write_text(case.resolved_json() + "\n")
+    (directory / "case.json").write_text(case.resolved_json())
     return case
 
 
@@ -105,28 +128,29 @@ class Recorder:
     """Listens to the run: history, snapshots, checkpoints, progress. All methods are collective."""
 
     def __init__(
-        self, directory: Path, mesh: Mesh, scheme: Scheme, state: State, wall_time: float | None, progress: bool
+        self,
+        directory: Path,
+        mesh: Mesh,
+        scheme: Scheme,
+        state: State,
+        wall_time: float | None,
+        requests: Requests,
+        progress: bool,
     ) -> None:
         """wall_time: seconds that the run has already taken before it was resumed; None: a fresh run."""
         case, self.ranks = scheme.d.case, scheme.d.share.ranks
         fresh = wall_time is None
-        self.directory, self.mesh, self.progress = directory, mesh, progress
+        self.directory, self.mesh, self.requests, self.progress = directory, mesh, requests, progress
         self.began = time.monotonic() - (wall_time or 0.0)
-        self.collector = Collector(scheme.d.share, output.block_size(len(mesh.nodes), self.ranks))
+        self.collector = Collector(scheme.d.share, output.block_size(directory, len(mesh.nodes), self.ranks, fresh))
         self.observables = Observables(case, mesh, scheme.d, len(state.slot_of))
-        self.rows = output.History(directory, None if fresh else state.time) if self.ranks.root else None
+        self.rows = output.History(directory, state.time if state.step else None) if self.ranks.root else None
         self.snapshots = output.Snapshots(directory, case, mesh, self.collector, fresh)
-        self.flags = {signal.SIGUSR1: False, signal.SIGTERM: False}
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
         self.vacancy_ratio, self.live_fraction = 0.0, 1.0
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
-        for number in (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._signalled)
         if self.ranks.root:
             record_start(directory, case, self.ranks.size, fresh)
-
-    def _signalled(self, number: int, frame: object) -> None:
-        self.flags[signal.SIGUSR1 if number == signal.SIGUSR1 else signal.SIGTERM] = True
 
     def history(self, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
         """Append a row."""
@@ -140,13 +164,18 @@ class Recorder:
         self.snapshots.write(number, time_, state, u)
 
     def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
-        """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
+        """Checkpoint when it is time or somebody asks; True when somebody asks for the end.
+
+        Both wait for a moment that a resumed run can go on from without a trace, some steps at most.
+        """
         due = time.monotonic() - self.checkpoint_clock >= scheme.d.case.output.checkpoint_every
-        wanted = [due and self.ranks.root, self.flags[signal.SIGUSR1], self.flags[signal.SIGTERM]]
+        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
         due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
+        self._show(scheme, state)
+        if not traceless(integrator):
+            return False
         if (due or asked) and not stop:
             self.checkpoint(scheme, state, integrator)
-        self._show(scheme, state)
         return bool(stop)
 
     def checkpoint(self, scheme: Scheme, state: State, integrator: Integrator) -> None:
@@ -158,7 +187,7 @@ class Recorder:
         }  # fmt: skip
         checkpoint.write(self.directory, scheme, state, self.collector, self.mesh, notes)
         self.checkpoint_time, self.checkpoint_clock = state.time, time.monotonic()
-        self.flags[signal.SIGUSR1] = False
+        self.requests.checkpoint = False
 
     def close(self) -> None:
         """Close the history."""
@@ -185,6 +214,11 @@ class Recorder:
             "remaining": (end - state.time) / speed if speed > 0.0 else None,
         }  # fmt: skip
         print(json.dumps(line), flush=True)
+
+
+def traceless(integrator: Integrator) -> bool:
+    """Whether the next step rests on nothing but the state and `memory`: not on an earlier rate or stiffness."""
+    return not isinstance(integrator, Chebyshev) or not integrator.fresh or integrator.age % RELAX_EVERY == 0
 
 
 def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
@@ -231,22 +265,24 @@ def versions() -> dict[str, str]:
 
 
 def give_up(error: BaseException, ranks: Ranks, directory: Path) -> int:
-    """Write down what went wrong on this rank, and end all ranks."""
+    """Write down what went wrong on this rank, and end all ranks, even where it cannot be written down."""
     refused = isinstance(error, REFUSALS)
     where = f"rank {ranks.rank}: " if ranks.size > 1 and not refused else ""
     message = f"{where}{error}" if refused else f"{where}{type(error).__name__}: {error}"
-    if isinstance(error, output.DirectoryError):
-        print(f"refused: {message}", file=sys.stderr, flush=True)  # the directory is not ours to write into
-    else:
-        directory.mkdir(parents=True, exist_ok=True)
+    state = "refused" if refused else "failed"
+    try:
+        if isinstance(error, output.DirectoryError):
+            print(f"refused: {message}", file=sys.stderr, flush=True)  # the directory is not ours to write into
+            return EXIT_STATUS[state]
         if not refused:
+            traceback.print_exception(error)
             with open(directory / "log.txt", "a") as log:
                 log.write(where + "".join(traceback.format_exception(error)))
-            traceback.print_exception(error)
-        record_end(directory, "refused" if refused else "failed", message)
-    if ranks.size > 1:
-        ranks.abort(EXIT_STATUS["refused" if refused else "failed"])
-    return EXIT_STATUS["refused" if refused else "failed"]
+        record_end(directory, state, message)
+    finally:
+        if ranks.size > 1:
+            ranks.abort(EXIT_STATUS[state])
+    return EXIT_STATUS[state]
 
 
 if __name__ == "__main__":

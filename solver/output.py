@@ -25,8 +25,8 @@ class DirectoryError(ValueError):
 
 
 def write_json(path: Path, tree: Any) -> None:
-    """Write beside, make durable, rename."""
-    beside = path.with_name(path.name + ".new")
+    """Write beside, make durable, rename; safe where several ranks do so at once."""
+    beside = path.with_name(f"{path.name}.{os.getpid()}.new")
     beside.write_text(json.dumps(tree, indent=2) + "\n")
     replace_durably(beside, path)
 
@@ -91,6 +91,9 @@ class Snapshots:
         self.path, self.collector, self.ranks = directory / "snapshots.zarr", collector, collector.share.ranks
         if self.ranks.root and fresh:
             create_group(self.path, case, mesh, collector.block)
+        elif self.ranks.root:
+            for torn in self.path.rglob("*.partial"):  # files that zarr was writing when the run was killed
+                torn.unlink()
         self.ranks.barrier()
 
     def write(self, number: int, time: float, state: State, u: Floats) -> None:
@@ -112,12 +115,11 @@ class Snapshots:
 
         names = ("rho", "eta_squared", "particle", "time")
         stored = {name: zarr.open_array(self.path, path=name, mode="r+") for name in names}
-        if stored["time"].shape[0] > number:
-            return
-        grown(self.path, "time", number + 1)[number] = time
-        for array in stored.values():
-            array.resize((number + 1, *array.shape[1:]))
-        consolidate(self.path)
+        if stored["time"].shape[0] <= number:
+            grown(self.path, "time", number + 1)[number] = time
+            for array in stored.values():
+                array.resize((number + 1, *array.shape[1:]))
+        consolidate(self.path)  # again too, where a run was killed just before this line
 
 
 def owners(u: Floats, state: State) -> tuple[Numbers, Floats]:
@@ -175,6 +177,13 @@ def consolidate(path: Path) -> None:
         zarr.consolidate_metadata(path)
 
 
-def block_size(nodes: int, ranks: Ranks) -> int:
-    """Nodes per chunk: at most BLOCK, and at least one chunk per rank where there are nodes enough."""
-    return max(1, min(BLOCK, -(-nodes // ranks.size)))
+def block_size(directory: Path, nodes: int, ranks: Ranks, fresh: bool) -> int:
+    """Nodes per chunk: at most BLOCK, and at least one chunk per rank where there are nodes enough.
+
+    A resumed run keeps the chunks that are there, whatever its ranks: only then does each have one writer.
+    """
+    import zarr
+
+    if fresh:
+        return max(1, min(BLOCK, -(-nodes // ranks.size)))
+    return int(zarr.open_array(directory / "snapshots.zarr", path="rho", mode="r").chunks[1])

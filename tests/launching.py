@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
@@ -20,11 +20,11 @@ import h5py
 import numpy as np
 import psutil
 import zarr
-from frit.service.launch import OPEN_MPI, clean_environment, is_open_mpi, mpirun_command, solver_arguments
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
-Case = Mapping[str, Mapping[str, Any]]
+from frit.service.launch import OPEN_MPI, clean_environment, is_open_mpi, mpirun_command, solver_arguments
+from frit.solver.arrays import Array
+
+Case = dict[str, dict[str, Any]]
 
 TIMEOUT = 240.0  # seconds
 FIELDS = ("rho", "eta_squared", "particle")
@@ -94,6 +94,13 @@ class Tree:
                 if process.environ().get("FRIT_TEST_MARK") == self.mark:
                     found.append(process.pid)
         return found
+
+    def gone(self) -> bool:
+        """Whether nobody is left; who is about to end gets the time for it."""
+        deadline = time.monotonic() + 20.0
+        while self.alive() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        return not self.alive()
 
     def kill(self) -> None:
         """kill -9, until nobody is left who could start another."""

@@ -7,11 +7,9 @@ import pytest
 import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from frit.solver.arrays import Floats
 from frit.solver.energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
-
-Floats = NDArray[np.float64]
 
 TABLE_2 = Coefficients(
     A=16.0, B=1.0, L=10.0, kappa_rho=10.0, kappa_eta=1.0, D_vol=0.01, D_vap=0.001, D_surf=4.0, D_gb=0.4,
@@ -70,8 +68,11 @@ def test_derivatives_are_those_of_the_energy(rho: float, eta: Floats, m: Coeffic
     S2, S3 = float((eta**2).sum()), float((eta**3).sum())
     assert df_drho(rho, S2, S3, m) == pytest.approx(slope(lambda d: f(rho + d, eta, m)), abs=20 * ROUND_OFF)
     for a, unit in enumerate(np.eye(len(eta))):
-        numeric = slope(lambda d, unit=unit: f(rho, eta + d * unit, m))  # type: ignore[misc]
-        assert df_deta(float(eta[a]), rho, S2, m) == pytest.approx(numeric, abs=20 * ROUND_OFF)
+
+        def along(d: float, unit: Floats = unit) -> float:
+            return f(rho, eta + d * unit, m)
+
+        assert df_deta(float(eta[a]), rho, S2, m) == pytest.approx(slope(along), abs=20 * ROUND_OFF)
 
 
 @pytest.mark.parametrize("particles", [1, 2, 4])

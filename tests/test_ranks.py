@@ -80,14 +80,13 @@ def test_two_ranks_take_the_adaptive_steps_of_one(tmp_path: Path) -> None:
 def test_an_exception_on_one_rank_ends_all(tmp_path: Path, rank: int) -> None:
     """The others wait in an exchange that never comes: without an abort this hangs."""
     with launch(PAIR, tmp_path / "run", ranks=2, script=BROKEN.replace("{rank}", str(rank))) as tree:
-        status, printed = tree.ended()
-        assert tree.alive() == []
+        status, _ = tree.ended()
+        assert tree.gone()
     assert status != 0
     message = f"rank {rank}: ValueError: the sum came out wrong"
-    assert message in printed
     ended = record(tmp_path / "run")
     assert (ended["state"], ended["message"]) == ("failed", message)
-    log = (tmp_path / "run/log.txt").read_text()
+    log = (tmp_path / "run/log.txt").read_text()  # mpich may drop what a rank prints just before the abort
     assert message in log
     assert "Traceback" in log
 
@@ -110,7 +109,7 @@ def test_a_refused_case_ends_all(tmp_path: Path) -> None:
     wrong = PAIR | {"time": {"integrator": "rk2", "end": -1.0}}
     with launch(wrong, tmp_path / "run", ranks=2) as tree:
         status, printed = tree.ended()
-        assert tree.alive() == []
+        assert tree.gone()
     assert status == 2
     assert "time.end = -1.0: must be greater than 0" in printed
     assert record(tmp_path / "run")["state"] == "refused"
@@ -121,6 +120,6 @@ def test_a_place_that_cannot_be_written_ends_all(tmp_path: Path) -> None:
     path = write_case(tmp_path / "case", PAIR)
     with Tree(2, path, "--out", path / "run") as tree:
         status, printed = tree.ended()
-        assert tree.alive() == []
+        assert tree.gone()
     assert status != 0
     assert "NotADirectoryError" in printed

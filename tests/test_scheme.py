@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import reference
-from numpy.typing import NDArray
 
+from frit.solver.arrays import Floats
 from frit.solver.case import Case, parse_case
 from frit.solver.geometry import Mesh
 from frit.solver.partition import Ranks
@@ -15,7 +15,6 @@ from frit.solver.prepare import build_mesh, make_integrator, prepare
 from frit.solver.scheme import Scheme
 from frit.solver.state import State, width
 
-Floats = NDArray[np.float64]
 Tree = dict[str, Any]
 
 LME, LINEAR = {"kind": "lme", "gamma": 1.8}, {"kind": "linear"}
@@ -29,7 +28,10 @@ def small_case(dim: int, shape: Tree, model: Tree, particles: int = 3, activatio
     plane = {
         "domain": {"size": [17.0, 15.0]},
         "nodes": {"spacing": 1.0},
-        "particles": {"centres": [[5.0, 5.1], [11.0, 5.0], [8.0, 10.2]][:particles], "radii": [3.1, 2.9, 3.0][:particles]},
+        "particles": {
+            "centres": [[5.0, 5.1], [11.0, 5.0], [8.0, 10.2]][:particles],
+            "radii": [3.1, 2.9, 3.0][:particles],
+        },
     }
     space = {
         "domain": {"size": [8.5, 8.2, 6.0]},
@@ -86,7 +88,7 @@ def check(scheme: Scheme, state: State, mesh: Mesh, N: Floats, dN: Floats, toler
 @pytest.mark.parametrize("shape", [LME, LINEAR, LME | {"gamma": 4.0}], ids=["lme", "linear", "narrow"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_rates_agree_with_the_reference(ranks: Ranks, dim: int, shape: Tree, model: Tree) -> None:
-    """The same sums of up to some thousand terms in another order: 1e-14 seen, with single terms up to 100 times the sum."""
+    """The same sums of up to some thousand terms in another order; single terms are up to 100 times their sum."""
     case = small_case(dim, shape, model)
     mesh = build_mesh(case, ranks)
     scheme, state = prepare(case, mesh, ranks)
@@ -96,7 +98,7 @@ def test_rates_agree_with_the_reference(ranks: Ranks, dim: int, shape: Tree, mod
 
 @pytest.mark.parametrize("shape", [LME, LINEAR], ids=["lme", "linear"])
 def test_rates_agree_with_the_reference_and_its_own_shape_functions(ranks: Ranks, shape: Tree) -> None:
-    """Nothing but the mesh is shared. The reference's multipliers are exact to 1e-13; gradients divide by the spacing."""
+    """Nothing but the mesh is shared. Newton ends at 1e-13 h at the latest in both; forces multiply it by k = 100."""
     case = small_case(2, shape, HUANG)
     mesh = build_mesh(case, ranks)
     scheme, state = prepare(case, mesh, ranks)
@@ -116,7 +118,7 @@ def test_rates_agree_with_the_reference_and_its_own_shape_functions(ranks: Ranks
 @pytest.mark.parametrize("model", [STILL, HUANG, WANG], ids=["still", "huang", "wang"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_mass_is_conserved(ranks: Ranks, dim: int, model: Tree) -> None:
-    """sum_a grad N_a = 0 at every point, so every flux is taken from some nodes and given to others: round-off remains."""
+    """sum_a grad N_a = 0 at every point: a flux is taken from some nodes and given to others. Round-off remains."""
     case = small_case(dim, LME, model)
     scheme, state = prepare(case, build_mesh(case, ranks), ranks)
     disturb(state, 3)
@@ -127,7 +129,10 @@ def test_mass_is_conserved(ranks: Ranks, dim: int, model: Tree) -> None:
 @pytest.mark.parametrize("shape", [LME, LINEAR], ids=["lme", "linear"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_uniform_fields_stay_uniform(ranks: Ranks, dim: int, shape: Tree) -> None:
-    """W = df/drho, d rho/dt = 0 and d eta/dt = -L df/deta at every node, walls included; 1e-15 of W = 5 over h^2 is left."""
+    """W = df/drho, d rho/dt = 0 and d eta/dt = -L df/deta at every node, walls included.
+
+    Round-off of W = 5, and of L kappa_eta = 10 times the gradients, over the small masses of nodes in corners.
+    """
     case = small_case(dim, shape, HUANG)
     scheme, state = prepare(case, build_mesh(case, ranks), ranks)
     rho, eta = np.array(0.7), np.array([0.3, 0.2, 0.6])
@@ -197,7 +202,8 @@ def test_a_rigid_translation_carries_the_centre_of_mass(ranks: Ranks, dim: int, 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_relaxed_contacts_are_an_implicit_step_of_the_forces(ranks: Ranks, dim: int, model: Tree) -> None:
     """V_tau is the motion under the forces that it leaves behind after tau: those of
-    rho - tau sum_c V_c . grad(rho eta_c^2) [wang: grad(rho eta_c)] at the points, linear in V_tau. Round-off of the solve.
+    rho - tau sum_c V_c . grad(rho eta_c^2) [wang: grad(rho eta_c)] at the points. Both sides are linear in V_tau: what
+    differs is the round-off of a solve whose condition, the free motion over the relaxed one, is below 1000.
     """
     case, tau = small_case(dim, LME, model, particles=2), 0.01
     mesh = build_mesh(case, ranks)
@@ -296,12 +302,10 @@ def compare(
 
 @pytest.mark.parametrize("eps", EPS)
 @pytest.mark.parametrize("model", [STILL, HUANG, WANG], ids=["still", "huang", "wang"])
-def test_switching_points_off_costs_eps(
-    ranks: Ranks, pack: tuple[Tree, Mesh, State], model: Tree, eps: float
-) -> None:
-    """A switched-off point withholds less than L kappa_eta eps of flux, and of reaction L 12 B eta with eta below eps / 2:
-    the tail of a tanh has grad eta = 2 eta / xi. Together below 100 eps. It still pays its share of W, and of the motion:
-    these are exact to round-off, at the nodes between live and still points too.
+def test_switching_points_off_costs_eps(ranks: Ranks, pack: tuple[Tree, Mesh, State], model: Tree, eps: float) -> None:
+    """A switched-off point withholds a flux of at most L kappa_eta eps, and the reaction 12 L B eta with eta < eps/2:
+    the tail of a tanh has grad eta = 2 eta / xi. Together below 100 eps. It still pays its shares of W and of the
+    motion: both are exact to round-off, also at the nodes between live and still points.
     """
     switches = {"enabled": True, "few_order_parameters": False, "eps_rho": eps, "eps_eta": eps}
     scheme, full, rate, exact = compare(ranks, pack, model, switches)
@@ -320,8 +324,8 @@ def test_switching_points_off_costs_eps(
 def test_few_order_parameters_cost_thirty_eps(
     ranks: Ranks, pack: tuple[Tree, Mesh, State], model: Tree, eps: float
 ) -> None:
-    """Where an order parameter and its gradient are below 30 eps it does not exist: of the reaction 12 L B 30 eps = 3600 eps
-    is lost at most. W sees its square. The worst seen is 2000 eps, in d eta/dt.
+    """An order parameter does not exist where it and its gradient are below 30 eps: the reaction 12 L B eta loses up to
+    3600 eps, the flux L kappa_eta grad eta 300 eps times the gradients of N, 2 / h. W sees squares, 6 B eta^2.
     """
     for enabled in (False, True):
         switches = {"enabled": enabled, "few_order_parameters": True, "eps_rho": eps, "eps_eta": eps}
@@ -329,7 +333,7 @@ def test_few_order_parameters_cost_thirty_eps(
         nodes = scheme.active.nodes
         assert scheme.active.owner.shape[1] == 3
         assert (scheme.active.owner < 0).any()
-        assert np.abs(rate - exact)[nodes].max() < 3600 * eps
+        assert np.abs(rate - exact)[nodes].max() < 4200 * eps
         assert np.abs(scheme.W - full.W)[nodes].max() < 10 * (30 * eps) ** 2
         np.testing.assert_allclose(scheme.motion, full.motion, rtol=0, atol=1e-10)
 
@@ -347,29 +351,16 @@ def test_mass_is_conserved_with_points_switched_off(ranks: Ranks, pack: tuple[Tr
     assert abs(share.sum()) < 1e-14 * np.abs(share).sum()
 
 
-def test_nodes_between_live_and_still_points_are_not_disturbed(
-    ranks: Ranks, pack: tuple[Tree, Mesh, State]
-) -> None:
-    """Without the shares of still points these nodes would see a step in W, and a moving grain would tear off its core.
-
-    The rates there, up to 2, are as exact as everywhere: rho to 10 eps, less than the 100 eps of the reaction of eta.
+def test_still_points_pay_their_shares(ranks: Ranks, pack: tuple[Tree, Mesh, State]) -> None:
+    """Without them the nodes between live and still points would see a step in W, and the advection of a moving grain
+    would end there: errors that do not fall with eps, a hundred times those that remain.
     """
-    scheme, full, rate, exact = compare(ranks, pack, HUANG, {"few_order_parameters": False})
+    scheme, _, rate, exact = compare(ranks, pack, HUANG, {"few_order_parameters": False})
     edge = scheme.active.edge_nodes
     assert edge.size > 50
-    assert np.abs(rate - exact)[edge, 0].max() < 10e-5
-    assert np.abs(rate - exact)[edge, 1:].max() < 100e-5
-
-
-def test_choosing_again_changes_nothing(ranks: Ranks, pack: tuple[Tree, Mesh, State]) -> None:
-    """A resumed run chooses the live points of its reference state again, and must come to the same set."""
-    shape, mesh, state = pack
-    own = replace(state, u=state.u.copy(), owner=state.owner.copy(), slot_of=state.slot_of.copy())
-    scheme, own = prepare(pack_case(shape, activation={}), mesh, ranks, own)
-    first, u, owner = scheme.active, own.u.copy(), own.owner.copy()
-    scheme.activate(own)
-    np.testing.assert_array_equal(scheme.active.live, first.live)
-    np.testing.assert_array_equal(scheme.active.owner, first.owner)
-    np.testing.assert_array_equal(own.u, u)
-    np.testing.assert_array_equal(own.owner, owner)
-    assert scheme.active.stale(own.u, 1e-5, 1e-5) == 0.0
+    error = np.abs(rate - exact)[edge].max()
+    scheme.active.potential[:] = 0.0
+    scheme.active.drift[:] = 0.0
+    state = everything(pack[2])
+    crude = np.abs(rates_of(scheme, state)[:, :4] - exact)[edge].max()
+    assert error < 0.01 * crude

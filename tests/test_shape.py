@@ -7,13 +7,11 @@ import meshio
 import numpy as np
 import pytest
 import reference
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
+from frit.solver.arrays import Floats
 from frit.solver.geometry import Mesh, file_mesh, lattice
 from frit.solver.shape import ShapeError, ShapeTable, linear, lme, search_range
-
-Floats = NDArray[np.float64]
 
 ROW, CUBE = np.sqrt(3) / 2, 2 / np.sqrt(3)  # rows of the triangular, edge of the body-centred lattice of spacing 1
 PLANE, SPACE = (10.0, 10 * ROW), (5 * CUBE, 4 * CUBE, 4 * CUBE)  # boxes that these lattices fill unstretched

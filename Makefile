@@ -1,0 +1,54 @@
+# make run    set up everything and sinter the example pack, with a picture
+# make test   set up everything and run the tests       (make slow: the long ones; make lint; make bench)
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+RANKS ?= 2
+CASE ?= sweeps/cases/pack.toml
+OUT ?= runs/$(basename $(notdir $(CASE)))
+
+# Installed as a strict editable package: a new or removed file asks for a new install, an edited one does not.
+FILES := $(sort $(wildcard solver/*.py service/*.py sweeps/*.py))
+LISTED := $(VENV)/.files-$(shell echo "$(FILES)" | cksum | cut -d' ' -f1)
+
+.PHONY: run test slow lint bench setup clean
+
+run: setup
+	@if [ -e "$(OUT)/run.json" ]; then \
+	  case "$$(sed -n 's/.*"state": "\([a-z]*\)".*/\1/p' "$(OUT)/run.json")" in \
+	    done) echo "$(OUT) is done already; make clean removes it" ;; \
+	    *) $(BIN)/frit resume "$(OUT)" ;; \
+	  esac; \
+	else $(BIN)/frit run "$(CASE)" --ranks $(RANKS) --out "$(OUT)"; fi
+	$(BIN)/frit plot "$(OUT)" --out "$(OUT)/history.png"
+	$(BIN)/frit plot "$(OUT)" --time 0 --out "$(OUT)/start.png"
+	$(BIN)/frit plot "$(OUT)" --time 1e9 --out "$(OUT)/end.png"
+
+test: setup
+	$(BIN)/python -m pytest
+
+slow: setup
+	$(BIN)/python -m pytest -m slow
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/mypy tests
+
+bench: setup
+	$(BIN)/python tests/benchmarks/bench.py
+
+setup: $(LISTED)
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "frit needs Python 3.11 or newer"'
+	$(PYTHON) -m venv $(VENV)
+
+$(LISTED): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[test,lint]'
+	rm -f $(VENV)/.files-*
+	touch $@
+
+clean:
+	rm -rf runs build *.egg-info

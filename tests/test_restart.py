@@ -1,0 +1,209 @@
+"""A run that was stopped, killed or moved to other ranks ends as one that nobody touched."""
+
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from launching import PAIR, Case, Tree, different, finish, history, launch, record, resume, solve, write_case
+
+# Sums of the same terms, but a loop that starts at another address may add them in another order.
+SAME = 1e-12
+
+ADAPTIVE = PAIR | {
+    "time": {"integrator": "adaptive", "end": 0.3},
+    "output": {"history_every": 0.01, "snapshots": [0.0, 0.17, 0.3]},
+}
+CASES: dict[str, Case] = {
+    "rk2": PAIR,
+    "adaptive": ADAPTIVE,
+    # Nothing is switched off: rates and contacts' stiffness are carried over from step to step.
+    "carried": ADAPTIVE | {"activation": {"enabled": False, "few_order_parameters": False}},
+}
+
+# The solver waits for a signal after the given steps; "<rank>.<step>" in the run directory tells that it does.
+HELD = """
+import sys, time
+from frit.solver import __main__ as solver
+
+after_step, steps = solver.Recorder.after_step, {steps}
+
+def hold(self, scheme, state, integrator):
+    if state.step in steps:
+        (self.directory / f"{self.ranks.rank}.{state.step}").touch()
+        while not (self.requests.checkpoint or self.requests.end):
+            time.sleep(0.005)
+    return after_step(self, scheme, state, integrator)
+
+solver.Recorder.after_step = hold
+sys.exit(solver.main())
+"""
+
+# The same before there is a mesh; it waits until all signals it may get have come.
+STARTING = """
+import sys, time
+from pathlib import Path
+from frit.solver import __main__ as solver
+
+build_mesh, Requests = solver.build_mesh, solver.Requests
+
+class Seen(Requests):
+    def __init__(self):
+        super().__init__()
+        Seen.one = self
+
+def hold(case, ranks):
+    Path(sys.argv[sys.argv.index("--out") + 1], f"{ranks.rank}.start").touch()
+    while not (Seen.one.checkpoint and Seen.one.end):
+        time.sleep(0.005)
+    return build_mesh(case, ranks)
+
+solver.Requests, solver.build_mesh = Seen, hold
+sys.exit(solver.main())
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Every case, undisturbed, on one rank."""
+    folder = tmp_path_factory.mktemp("whole")
+    return {name: solve(case, folder / name) for name, case in CASES.items()}
+
+
+def held(tree: Tree, directory: Path, ranks: int, where: object) -> None:
+    """Wait until all ranks wait."""
+    tree.until(lambda: all((directory / f"{rank}.{where}").exists() for rank in range(ranks)))
+
+
+def interrupted(
+    case: Case, directory: Path, ranks: int = 1, step: int = 17, number: signal.Signals = signal.SIGTERM
+) -> Path:
+    """A run that got a signal in the step."""
+    with launch(case, directory, ranks, HELD.replace("{steps}", str([step]))) as tree:
+        held(tree, directory, ranks, step)
+        tree.process.send_signal(number)
+        _, printed = tree.ended()
+        assert tree.gone()
+    assert record(directory)["state"] == "interrupted", printed
+    return directory
+
+
+def checkpoint_step(directory: Path) -> int:
+    with h5py.File(directory / "checkpoint.h5") as file:
+        return int(file.attrs["step"])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, whole: dict[str, Path], name: str) -> None:
+    directory = interrupted(CASES[name], tmp_path / "run")
+    assert 17 <= checkpoint_step(directory) < 17 + 5  # it may wait until nothing is carried over
+    assert len(history(directory)) < len(history(whole[name]))
+    assert different(whole[name], resume(directory), SAME) == {}
+
+
+@pytest.mark.parametrize("name", ["rk2", "carried"])
+def test_a_resumed_run_is_the_uninterrupted_one_on_two_ranks(tmp_path: Path, name: str) -> None:
+    together = solve(CASES[name], tmp_path / "whole", ranks=2)
+    directory = interrupted(CASES[name], tmp_path / "run", ranks=2)
+    assert different(together, resume(directory, ranks=2), SAME) == {}
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 1)])
+def test_another_number_of_ranks_goes_on(tmp_path: Path, whole: dict[str, Path], before: int, after: int) -> None:
+    """Agrees as runs on different ranks do, see test_ranks.py; the chunks of the snapshots stay as they were."""
+    directory = resume(interrupted(PAIR, tmp_path / "run", before), after)
+    assert record(directory)["ranks"] == after
+    assert different(whole["rk2"], directory, 1e-10) == {}
+
+
+def test_usr1_writes_a_checkpoint_and_the_run_goes_on(tmp_path: Path, whole: dict[str, Path]) -> None:
+    directory = tmp_path / "run"
+    with launch(PAIR, directory, script=HELD.replace("{steps}", "[20, 60]")) as tree:
+        held(tree, directory, 1, 20)
+        assert checkpoint_step(directory) == 0
+        tree.process.send_signal(signal.SIGUSR1)
+        held(tree, directory, 1, 60)
+        assert checkpoint_step(directory) == 20
+        assert record(directory)["state"] == "running"
+        tree.process.send_signal(signal.SIGUSR1)
+        finish(tree, directory)
+    assert checkpoint_step(directory) == 100
+    assert different(whole["rk2"], directory, SAME) == {}
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+def test_int_and_term_end_with_a_checkpoint(tmp_path: Path, number: signal.Signals, ranks: int) -> None:
+    directory = interrupted(PAIR, tmp_path / "run", ranks, 20, number)
+    assert checkpoint_step(directory) == 20
+    assert "checkpoint at t = 0.002" in record(directory)["message"]
+    assert [row["step"] for row in history(directory)] == [0, 10, 20]
+
+
+def test_signals_before_the_first_step_are_heard(tmp_path: Path, whole: dict[str, Path]) -> None:
+    """A checkpoint asked for is no reason to die, and an end asked for still leaves something to resume."""
+    directory = tmp_path / "run"
+    with launch(PAIR, directory, ranks=2, script=STARTING) as tree:
+        held(tree, directory, 2, "start")
+        tree.process.send_signal(signal.SIGUSR1)
+        tree.process.send_signal(signal.SIGTERM)
+        _, printed = tree.ended()
+    assert record(directory)["state"] == "interrupted", printed
+    assert checkpoint_step(directory) == 0
+    assert different(whole["rk2"], resume(directory), 1e-10) == {}
+
+
+def test_a_checkpoint_with_slots_to_spare_goes_on(tmp_path: Path, whole: dict[str, Path]) -> None:
+    """Slots that were needed once are dealt out anew: the fields must follow their particles."""
+    directory = interrupted(PAIR, tmp_path / "run")
+    with h5py.File(directory / "checkpoint.h5", "r+") as file:
+        for name in ("u", "reference"):
+            u = np.zeros((len(file[name]), 16))
+            u[:, [0, 1, 9]] = file[name][:, :3]
+            del file[name]
+            file[name] = u
+        owner = np.full((len(u), 9), -1, dtype=np.int32)
+        owner[:, [0, 8]] = file["owner"][...]
+        del file["owner"]
+        file["owner"] = owner
+        file["slot_of"][...] = [0, 8]
+    assert different(whole["rk2"], resume(directory), SAME) == {}
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path: Path, whole: dict[str, Path]) -> None:
+    directory = tmp_path / "run"
+    shutil.copytree(whole["adaptive"], directory)
+    assert different(whole["adaptive"], resume(directory), 0.0) == {}
+
+
+@pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_kill_9_at_any_moment_leaves_no_trace(tmp_path: Path, kills: int) -> None:
+    """Every kill is at a moment of its own: while Python starts, in a step, or while rows, chunks, a checkpoint or
+    run.json are being written."""
+    case = PAIR | {
+        "time": {"integrator": "rk2", "end": 0.2, "step": 1e-4},
+        "output": {"history_every": 0.001, "snapshots": {"every": 0.005}, "checkpoint_every": 0.05},
+    }
+    began = time.monotonic()
+    undisturbed = solve(case, tmp_path / "whole")
+    share = 1.5 * (time.monotonic() - began) / kills
+    directory, random = tmp_path / "run", np.random.default_rng(kills)
+    path = write_case(directory, case)
+    for _ in range(kills):
+        started = len(record(directory).get("resumed", [])), record(directory).get("start")
+        goes_on = (directory / "checkpoint.h5").exists()
+        arguments = ["--resume", directory] if goes_on else [path, "--out", directory]
+        with Tree(1, *arguments) as tree:
+            while random.random() < 0.99 and tree.process.poll() is None:
+                time.sleep(0.005)
+                if started != (len(record(directory).get("resumed", [])), record(directory).get("start")):
+                    break
+            time.sleep(random.uniform(0.0, share))
+            tree.kill()
+    assert record(directory)["resumed"], "no kill hit the run itself"
+    resume(directory)
+    assert different(undisturbed, directory, SAME) == {}
+    assert list(directory.rglob("*.partial")) == []

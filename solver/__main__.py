@@ -34,6 +34,7 @@ from .state import State
 
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
+LONGEST_WAIT = 25  # steps for which a checkpoint that is due waits for one from which the run goes on without a trace
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
@@ -117,6 +118,8 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:
         if fresh:
             raise output.DirectoryError(f"{directory}: holds a run already; go on with --resume")
         raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from")
+    for torn in directory.glob("*.new"):  # what was being written when the run was killed
+        torn.unlink()
     if not fresh:
         return load_case(directory / "case.json")
     case = load_case(arguments.case)
@@ -147,7 +150,8 @@ class Recorder:
         self.rows = output.History(directory, state.time if state.step else None) if self.ranks.root else None
         self.snapshots = output.Snapshots(directory, case, mesh, self.collector, fresh)
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
-        self.vacancy_ratio, self.live_fraction = 0.0, 1.0
+        self.waited = 0
+        self.latest: dict[str, Any] = {}  # history row
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
         if self.ranks.root:
             record_start(directory, case, self.ranks.size, fresh)
@@ -155,7 +159,7 @@ class Recorder:
     def history(self, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
         """Append a row."""
         row = self.observables.row(scheme, state, u, time_, self._wall_time())
-        self.vacancy_ratio, self.live_fraction = row["vacancy_ratio"], row["live_fraction"]
+        self.latest = row
         if self.rows is not None:
             self.rows.append(row)
 
@@ -166,13 +170,15 @@ class Recorder:
     def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
         """Checkpoint when it is time or somebody asks; True when somebody asks for the end.
 
-        Both wait for a moment that a resumed run can go on from without a trace, some steps at most.
+        Both wait for a step after which a resumed run takes the very steps that this one takes, but not for long: then
+        the resumed run may differ, by as much as the integrator's tolerance allows.
         """
         due = time.monotonic() - self.checkpoint_clock >= scheme.d.case.output.checkpoint_every
         wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
         due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
         self._show(scheme, state)
-        if not traceless(integrator):
+        self.waited = 0 if traceless(integrator) or not (due or asked or stop) else self.waited + 1
+        if 0 < self.waited <= LONGEST_WAIT:
             return False
         if (due or asked) and not stop:
             self.checkpoint(scheme, state, integrator)
@@ -209,8 +215,8 @@ class Recorder:
         line = {
             "time": state.time, "end": end, "step": state.step, "evaluations": state.evaluations,
             "evaluations_per_second": (state.evaluations - evaluations_0) / elapsed,
-            "live_fraction": self.live_fraction,
-            "vacancy_ratio": self.vacancy_ratio,
+            "live_fraction": self.latest.get("live_fraction"),
+            "vacancy_ratio": self.latest.get("vacancy_ratio"),
             "remaining": (end - state.time) / speed if speed > 0.0 else None,
         }  # fmt: skip
         print(json.dumps(line), flush=True)

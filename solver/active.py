@@ -110,7 +110,8 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             return flags, owner
         claims, clashes = _claim(d, state, owner, clash)
         met = slots.meeting(claims, np.arange(d.nodes))
-        known = _everyones_pairs(d, np.concatenate([known, met, clashes]))
+        held = slots.meeting(state.owner, np.arange(d.nodes))
+        known = _everyones_pairs(d, np.concatenate([known, held, met, clashes]))
         clashes = _everyones_pairs(d, clashes)
         slot_of = state.slot_of
         if len(clashes):
@@ -120,9 +121,12 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             compact = False
         columns = width(int(slot_of.max()) + 1)
         if not len(clashes) and columns >= state.u.shape[1]:
+            changed = np.array([float((claims != state.owner).any())])
             state.owner = claims
             state.eta[claims < 0] = 0.0
-            return flags, owner
+            if d.share.ranks.max(changed)[0] == 0.0:
+                return flags, owner
+            continue
         state.slot_of = slot_of
         state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
 

@@ -53,8 +53,9 @@ def events(case: Case) -> list[Event]:
     marks = [(t, True, None) for t in [*rows, end]] + [(t, False, k) for k, t in enumerate(snapshots)]
     merged: list[Event] = []
     for time, history, snapshot in sorted(marks, key=lambda mark: mark[0]):
-        if merged and time - merged[-1].time <= SAME_TIME * end:
-            last = merged[-1]
+        last = merged[-1] if merged else None
+        near = last is not None and time - last.time <= SAME_TIME * end
+        if last is not None and near and (snapshot is None or last.snapshot is None):
             number = last.snapshot if snapshot is None else snapshot
             merged[-1] = Event(last.time, last.history or history, number)
         else:

@@ -225,7 +225,7 @@ def solve_lme(
     table: Floats, residual: Floats, points: Floats, spacing: Floats, nodes: Floats,
     offsets: Integers, near: Numbers, gamma: float,
 ) -> None:
-    """Fill table (1 + dim, e) and residual (p,) = |sum N (x - x_a)| / h; infinity where Newton did not converge.
+    """Fill table (1 + dim, e) and residual (p,) = |sum N (x - x_a)| / h; infinity where no Newton step could be taken.
 
     Newton on the convex log Z(lambda), with step halving where log Z would grow, in units of h.
     """
@@ -278,7 +278,10 @@ def solve_lme(
             size = norm(r)
             if size <= CONVERGED and size >= 0.5 * previous:
                 break
-        if not size <= CONVERGED or not invert(inverse, J):
+        if not size <= CONVERGED:
+            residual[p] = size
+            continue
+        if not invert(inverse, J):
             continue
         residual[p] = size
         for i in range(count):

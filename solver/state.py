@@ -76,7 +76,7 @@ def initial_state(case: Case, nodes: Floats) -> State:
     few = case.activation.few_order_parameters
     xi, radii = case.particles.interface_width, reach(case)
     centres = np.asarray(case.particles.centres)
-    cut = case.activation.eps_eta
+    cut = max(case.activation.eps_eta, TAIL)
     extent = radii + 0.5 * xi * np.log(1.0 / cut)
     slot_of = colour(_neighbours(centres, extent), len(radii)) if few else np.arange(len(radii), dtype=np.int32)
     slots = int(slot_of.max()) + 1

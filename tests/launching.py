@@ -27,7 +27,6 @@ from frit.solver.arrays import Array
 Case = dict[str, dict[str, Any]]
 
 TIMEOUT = 240.0  # seconds
-FIELDS = ("rho", "eta_squared", "particle")
 
 # Two touching discs that are alike in nothing, so that no value is decided by a tie; 100 steps.
 PAIR: Case = {
@@ -37,21 +36,6 @@ PAIR: Case = {
     "time": {"integrator": "rk2", "end": 0.01, "step": 1e-4},
     "output": {"history_every": 0.001, "snapshots": [0.0, 0.0035, 0.01]},
 }
-
-# The solver with a rest after each step: there is time to reach it with a signal between two rows.
-PATIENT = """
-import sys, time
-from frit.solver import __main__ as solver
-
-after_step = solver.Recorder.after_step
-
-def rest(*arguments):
-    time.sleep(0.01)
-    return after_step(*arguments)
-
-solver.Recorder.after_step = rest
-sys.exit(solver.main())
-"""
 
 
 class Tree:

@@ -49,8 +49,8 @@ def test_motion_makes_the_neck_grow_faster() -> None:
 def test_turned_pair_has_the_same_neck(radius: float, spacing: float, times: tuple[float, ...]) -> None:
     """30 degrees are the worst that a triangular lattice can do to a pair: necks agree to 1 % all the same.
 
-    At 20 spacings per radius this holds from the first instant. At the same number with spacing 1 the contact, a spacing wide
-    at first, is seen differently by the two orientations (1.3 % at t = 0.5), which is forgotten by t = 1.
+    At 20 spacings per radius this holds from the first instant. At the same number with spacing 1 the contact, a
+    spacing wide at first, is seen differently by the two orientations (1.3 % at t = 0.5), which is forgotten by t = 1.
     """
     side = 4.0 * radius + 20.0
 

@@ -1,0 +1,219 @@
+"""The command line with the solver behind it, as a user types it. What it says in each situation: test_cli.py."""
+
+import fcntl
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from launching import PAIR, TIMEOUT, different, history, record, snapshots
+
+# On a terminal it becomes that of its session, as a shell's would be.
+FRIT = """
+import fcntl, os, termios
+if os.isatty(0):
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+from frit.service.cli import main
+main()
+"""
+# Long enough to be interrupted wherever it runs; nobody waits for its end.
+ENDLESS = {
+    "time": {"integrator": "rk2", "end": 1000.0, "step": 1e-4},
+    "output": {"history_every": 0.001, "snapshots": [0.0, 1000.0]},
+}
+SHOWN = re.compile(r"t [\d.e-]+/1000 step \d+ [\d.e+]+ ev/s live \d+% vacancy 0\.\d{4} [\d:, a-z]+ left")
+
+CASE = """
+name = "a pair"
+[domain]
+size = [22.0, 13.0]
+[nodes]
+spacing = 1.0
+[particles]
+centres = [[6.5, 6.2], [15.4, 6.8]]
+radii = [5.0, 4.0]
+[time]
+integrator = "rk2"
+end = 0.01
+step = 1e-4
+[output]
+history_every = 0.001
+snapshots = [0.0, 0.0035, 0.01]
+"""
+
+
+@contextmanager
+def started(folder: Path, *arguments: str, **streams: Any) -> Iterator["subprocess.Popen[str]"]:
+    """frit in a session of its own. A test that fails meanwhile ends it as a user would."""
+    command = [sys.executable, "-P", "-c", FRIT, *arguments]
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "120"}
+    with subprocess.Popen(
+        command, cwd=folder, text=True, start_new_session=True, env=environment, **streams
+    ) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+
+
+def frit(folder: Path, *arguments: str) -> tuple[int, str, str]:
+    """Exit status, stdout, stderr."""
+    with started(folder, *arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        out, err = process.communicate(timeout=TIMEOUT)
+    return process.returncode, out, err
+
+
+def until_rows(directory: Path, process: "subprocess.Popen[str]", count: int) -> None:
+    deadline = time.monotonic() + TIMEOUT
+    while len(history(directory)) < count:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working folder with cases, and with one that has been run."""
+    folder = tmp_path_factory.mktemp("commands")
+    (folder / "pair.toml").write_text(CASE)
+    (folder / "endless.json").write_text(json.dumps(PAIR | ENDLESS))
+    (folder / "wrong.toml").write_text(CASE.replace("radii = [5.0", "radii = [-5.0"))
+    unstable = PAIR | {"time": {"integrator": "rk2", "end": 10.0, "step": 0.5}, "output": {"history_every": 0.5}}
+    (folder / "unstable.json").write_text(json.dumps(unstable))
+    status, out, err = frit(folder, "run", "pair.toml")
+    assert (status, err) == (0, ""), out + err
+    (folder / "said").write_text(out)
+    return folder
+
+
+def test_run_ends_with_a_summary_and_nothing_else(folder: Path) -> None:
+    """Nobody looks at a pipe: no bar, no control codes."""
+    rows = history(folder / "runs/pair")
+    said = (folder / "said").read_text()
+    words = dict(line.split(maxsplit=1) for line in said.splitlines())
+    assert (words["state"], words["steps"], words["evaluations"]) == ("done", "100", "200")
+    assert words["directory"] == "runs/pair"
+    assert said.count(f"{rows[0]['vacancy_ratio']:.6g} -> {rows[-1]['vacancy_ratio']:.6g}") == 1
+    assert "\x1b" not in said
+    assert record(folder / "runs/pair")["name"] == "a pair"
+
+
+def test_plots_of_a_real_run(folder: Path) -> None:
+    status, out, err = frit(folder, "plot", "runs/pair")
+    assert (status, out, err) == (0, "runs/pair/history.png: history\n", "")
+    status, out, err = frit(folder, "plot", "runs/pair", "--time", "0.004", "--out", "fields.png")
+    assert (status, out, err) == (0, "fields.png: snapshot at t = 0.0035\n", "")
+    for picture in ("runs/pair/history.png", "fields.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_finished_run_is_neither_run_nor_resumed_again(folder: Path) -> None:
+    before = record(folder / "runs/pair")
+    status, out, err = frit(folder, "run", "pair.toml")
+    assert (status, out) == (2, "")
+    assert "frit resume runs/pair" in err
+    status, out, err = frit(folder, "resume", "runs/pair", "--json")
+    assert status == 0
+    assert "done already" in err
+    assert json.loads(out)["steps"] == 100
+    assert record(folder / "runs/pair") == before
+
+
+def test_what_is_refused_ends_with_2_and_leaves_nothing(folder: Path) -> None:
+    status, out, err = frit(folder, "run", "wrong.toml")
+    assert (status, out) == (2, "")
+    assert "particles.radii" in err
+    assert "-5.0" in err
+    assert not (folder / "runs/wrong").exists()
+
+
+def test_a_run_that_fails_ends_with_1_and_the_reason(folder: Path) -> None:
+    status, out, err = frit(folder, "run", "unstable.json", "--json")
+    assert status == 1
+    assert json.loads(out)["state"] == "failed"
+    for words in ("step 1, node ", "likely cause", "see runs/unstable/log.txt"):
+        assert words in err
+
+
+def test_ctrl_c_and_resume(folder: Path) -> None:
+    """INT to frit alone: 130, a checkpoint, and the way to go on; then `resume` on the same ranks does, and TERM ends
+    it as well."""
+    directory = folder / "long"
+    with started(
+        folder, "run", "endless.json", "--ranks", "2", "--out", "long", stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        until_rows(directory, process, 3)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 130
+    assert "interrupted" in out
+    assert "`frit resume long` goes on" in err
+    rows = history(directory)
+    assert len(rows) >= 3
+
+    with started(folder, "resume", "long", "--json", stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        until_rows(directory, process, len(rows) + 2)
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=TIMEOUT)
+    assert (process.returncode, record(directory)["ranks"]) == (130, 2)
+    assert json.loads(out)["state"] == "interrupted"
+    again = history(directory)
+    assert again[: len(rows)] == rows
+    assert [row["time"] for row in again] == [k * 0.001 for k in range(len(again))]
+
+
+def test_resume_ends_like_an_undisturbed_run(folder: Path) -> None:
+    """The run directory of pair.toml, taken back to its first checkpoint by stopping it at once."""
+    with started(folder, "run", "pair.toml", "--out", "cut", stdout=subprocess.DEVNULL) as process:
+        until_rows(folder / "cut", process, 1)
+        process.send_signal(signal.SIGINT)
+        process.wait(TIMEOUT)
+    status, _, err = frit(folder, "resume", "cut")
+    assert status == 0, err
+    assert different(folder / "runs/pair", folder / "cut", 1e-12) == {}
+    assert snapshots(folder / "cut")["time"].tolist() == [0.0, 0.0035, 0.01]
+
+
+def test_progress_on_a_terminal(folder: Path) -> None:
+    """Time, step, evaluations per second, live fraction, vacancy ratio, time left; and Ctrl-C typed there."""
+    here, there = os.openpty()
+    fcntl.ioctl(there, termios.TIOCSWINSZ, np.array([24, 120, 0, 0], dtype=np.uint16).tobytes())
+    arguments = ("run", "endless.json", "--out", "watched")
+    with started(folder, *arguments, stdin=there, stdout=there, stderr=there) as process:
+        os.close(there)
+        screen = ""
+        while not SHOWN.search(screen):
+            screen += os.read(here, 4096).decode(errors="replace")
+        os.write(here, b"\x03")
+        with suppress(OSError):  # how a terminal ends that nobody holds any more
+            while True:
+                screen += os.read(here, 4096).decode(errors="replace")
+        process.wait(TIMEOUT)
+    os.close(here)
+    assert process.returncode == 130
+    assert "writing a checkpoint; Ctrl-C again kills" in screen
+    assert record(folder / "watched")["state"] == "interrupted"
+
+
+def test_schema_describes_the_case_that_runs(folder: Path) -> None:
+    status, out, err = frit(folder, "schema")
+    assert (status, err) == (0, "")
+    schema = json.loads(out)
+    case = json.loads((folder / "runs/pair/case.json").read_text())
+    assert schema["type"] == "object"
+    assert set(case) == set(schema["properties"])
+    for table, values in case.items():
+        if isinstance(values, dict):
+            properties = schema["$defs"][schema["properties"][table]["$ref"].rpartition("/")[2]]["properties"]
+            assert set(values) <= set(properties)

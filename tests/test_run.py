@@ -1,0 +1,221 @@
+"""The run between its output times: which they are, who hears of them, and what is said when it goes wrong."""
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from frit.solver.arrays import Floats
+from frit.solver.case import Case, parse_case
+from frit.solver.geometry import Mesh
+from frit.solver.integrators import Integrator
+from frit.solver.partition import Ranks
+from frit.solver.prepare import build_mesh, make_integrator, prepare
+from frit.solver.run import Event, RunError, check, events, run
+from frit.solver.scheme import Scheme
+from frit.solver.state import State
+
+
+def discs(model: dict[str, Any] | None = None, output: dict[str, Any] | None = None, **time: Any) -> Case:
+    """Two touching discs of 3 nm: a few milliseconds per step."""
+    return parse_case({
+        "domain": {"size": [17.0, 10.0]},
+        "nodes": {"spacing": 1.0},
+        "particles": {"centres": [[5.2, 5.0], [11.3, 5.0]], "radii": [3.0, 3.2]},
+        "time": {"end": 1.0} | time,
+        "model": model or {},
+        "output": output or {},
+    })  # fmt: skip
+
+
+def start(case: Case, ranks: Ranks) -> tuple[Mesh, Scheme, State]:
+    mesh = build_mesh(case, ranks)
+    return mesh, *prepare(case, mesh, ranks)
+
+
+# --- output times
+
+
+def test_history_and_snapshots_at_one_time_are_one_event() -> None:
+    """Four rows and three snapshots, one of them at a time of its own."""
+    case = discs(output={"history_every": 0.25, "snapshots": [0.0, 0.6, 1.0]})
+    assert events(case) == [
+        Event(0.0, True, 0),
+        Event(0.25, True, None),
+        Event(0.5, True, None),
+        Event(0.6, False, 1),
+        Event(0.75, True, None),
+        Event(1.0, True, 2),
+    ]
+
+
+def test_multiples_that_differ_in_the_last_bit_are_one_event() -> None:
+    """3 * 0.1 is 0.30000000000000004: rows and snapshots reach it by different sums."""
+    case = discs(end=0.9, output={"history_every": 0.1, "snapshots": [0.3, 0.6, 0.7]})
+    got = events(case)
+    assert [event.snapshot for event in got] == [None, None, None, 0, None, None, 1, 2, None, None]
+    assert all(event.history for event in got)
+    assert got[-1].time == 0.9
+
+
+def test_the_end_is_an_event_where_nothing_asks_for_it() -> None:
+    case = discs(output={"history_every": 0.3, "snapshots": {"every": 0.4}})
+    got = events(case)
+    np.testing.assert_allclose([event.time for event in got], [0.0, 0.3, 0.4, 0.6, 0.8, 0.9, 1.0], rtol=1e-15)
+    assert [event.snapshot for event in got] == [0, None, 1, None, 2, None, None]
+    assert [event.history for event in got] == [True, True, False, True, False, True, True]
+
+
+@given(st.floats(0.1, 1e4), st.floats(0.003, 2.0), st.floats(0.01, 2.0))
+@settings(deadline=None)
+def test_events_of_any_case(end: float, row: float, snapshot: float) -> None:
+    """Whatever the intervals: from 0 to the end, apart, nothing missing, nothing twice."""
+    case = discs(end=end, output={"history_every": row * end, "snapshots": {"every": snapshot * end}})
+    got = events(case)
+    times = np.array([event.time for event in got])
+    assert times[0] == 0.0
+    assert times[-1] == pytest.approx(end, rel=1e-9)
+    assert (np.diff(times) > 1e-9 * end).all()
+    assert got[0].history
+    assert got[-1].history
+    numbers = [event.snapshot for event in got if event.snapshot is not None]
+    assert numbers == list(range(math.floor(1 / snapshot + 1e-12) + 1))
+    # A row at every multiple, at the end, and nowhere else.
+    rows = np.array([event.time for event in got if event.history])
+    wanted = np.append(np.arange(math.floor(1 / row + 1e-9) + 1) * row * end, end)
+    assert (np.abs(rows[:, None] - wanted).min(axis=0) <= 2e-9 * end).all()
+    assert (np.abs(rows[:, None] - wanted).min(axis=1) <= 2e-9 * end).all()
+
+
+# --- the observer
+
+
+class Log:
+    """Writes down what it hears; asks for the end after some steps."""
+
+    def __init__(self, stop: int = 10**9) -> None:
+        self.stop, self.steps = stop, 0
+        self.rows: list[float] = []
+        self.numbers: list[tuple[int, float]] = []
+        self.fields: dict[float, Floats] = {}
+
+    def history(self, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+        self.rows.append(time)
+        self.fields[time] = u.copy()
+
+    def snapshot(self, number: int, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+        self.numbers.append((number, time))
+
+    def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
+        self.steps += 1
+        return self.steps >= self.stop
+
+
+OUTPUT = {"history_every": 0.03, "snapshots": [0.0, 0.05, 0.1]}
+INTEGRATORS = [{"integrator": "rk2", "step": 5e-4}, {"integrator": "adaptive"}]
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=["rk2", "adaptive"])
+def test_the_observer_hears_of_every_event_in_order(ranks: Ranks, integrator: dict[str, Any]) -> None:
+    case = discs(output=OUTPUT, end=0.1, **integrator)
+    mesh, scheme, state = start(case, ranks)
+    log = Log()
+    assert run(scheme, state, make_integrator(case, mesh), log)
+    np.testing.assert_allclose(log.rows, [0.0, 0.03, 0.06, 0.09, 0.1], rtol=1e-12)
+    np.testing.assert_allclose([time for _, time in log.numbers], [0.0, 0.05, 0.1], rtol=1e-12)
+    assert [number for number, _ in log.numbers] == [0, 1, 2]
+    assert state.time == 0.1
+    np.testing.assert_array_equal(log.fields[log.rows[-1]], state.u)
+
+
+def test_fields_between_adaptive_steps_are_those_of_the_time(ranks: Ranks) -> None:
+    """Against rk2, whose steps end at the output times. Contacts relax within 0.05, here at speeds of some nm per unit:
+    rk2 is then wrong by 5e-4 (seen with shorter steps), and the adaptive contacts, which lag by 0.001, by 1.5e-3.
+    """
+    logs = []
+    methods: list[dict[str, Any]] = [{"integrator": "rk2", "step": 1e-4}, {"tolerance": 1e-4}]
+    for integrator in methods:
+        case = discs(output=OUTPUT, end=0.1, **integrator)
+        mesh, scheme, state = start(case, ranks)
+        logs.append(Log())
+        assert run(scheme, state, make_integrator(case, mesh), logs[-1])
+        assert scheme.active.owner.shape[1] == 2
+    for ours, theirs in zip(logs[0].rows, logs[1].rows, strict=True):
+        np.testing.assert_allclose(logs[0].fields[ours], logs[1].fields[theirs], rtol=0, atol=3e-3)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=["rk2", "adaptive"])
+def test_a_run_that_is_ended_goes_on_where_it_was(ranks: Ranks, integrator: dict[str, Any]) -> None:
+    """The second call gives the events that the first has not."""
+    case = discs(output=OUTPUT, end=0.1, **integrator)
+    mesh, scheme, state = start(case, ranks)
+    first, second = Log(stop=4), Log()
+    method = make_integrator(case, mesh)
+    assert not run(scheme, state, method, first)
+    assert 0.0 < state.time < 0.1
+    assert run(scheme, state, method, second)
+    np.testing.assert_allclose(first.rows + second.rows, [0.0, 0.03, 0.06, 0.09, 0.1], rtol=1e-12)
+    assert [number for number, _ in first.numbers + second.numbers] == [0, 1, 2]
+
+
+def test_who_asks_for_the_end_at_the_end_gets_a_finished_run(ranks: Ranks) -> None:
+    case = discs(end=0.002, integrator="rk2", step=0.001)
+    mesh, scheme, state = start(case, ranks)
+    assert run(scheme, state, make_integrator(case, mesh), Log(stop=101))
+    assert state.time == 0.002
+
+
+# --- fields that have lost their meaning
+
+CAUSE = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
+STIFF = ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
+MESSAGE = re.compile(
+    r"at t = (?P<time>[-\d.e]+), step (?P<step>\d+), node (?P<node>\d+) at \((?P<place>[-\d., ]+)\) nm: "
+    r"rho = (?P<rho>\S+?)(?P<eta>(, eta of particle \d+ = \S+?)*) left \[-0\.5, 1\.5\]; likely cause: (?P<cause>.*)"
+)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_a_step_far_too_long_ends_with_time_place_and_cause(ranks: Ranks, rigid: bool) -> None:
+    """0.1 is 20 times the paper's step, and three times the limit of stability even without rigid motion, 4 / 120.
+
+    Fields leave [-0.5, 1.5] within a few steps, long before they overflow.
+    """
+    case = discs({"rigid_motion": rigid}, {"history_every": 1.0}, integrator="rk2", step=0.1)
+    mesh, scheme, state = start(case, ranks)
+    with pytest.raises(RunError) as failure:
+        run(scheme, state, make_integrator(case, mesh), Log())
+    said = MESSAGE.fullmatch(str(failure.value))
+    assert said, str(failure.value)
+    assert float(said["time"]) == pytest.approx(state.time, rel=1e-5)
+    assert int(said["step"]) == state.step >= 1
+    assert said["cause"] == CAUSE + (STIFF if rigid else "")
+    node = int(said["node"])
+    np.testing.assert_allclose([float(x) for x in said["place"].split(",")], mesh.nodes[node], atol=5e-4)
+    assert float(said["rho"]) == pytest.approx(state.u[node, 0], rel=1e-3)
+    named = {int(a): float(value) for a, value in re.findall(r"eta of particle (\d+) = ([^\s,]+)", said["eta"])}
+    owned = {int(a): state.u[node, 1 + s] for s, a in enumerate(state.owner[node]) if a >= 0}
+    assert named.keys() == owned.keys()
+    assert all(named[a] == pytest.approx(owned[a], rel=1e-3) for a in named)
+    assert not all(-0.5 <= value <= 1.5 for value in (state.u[node, 0], *owned.values()))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1.5001, -0.5001])
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_a_single_bad_value_is_found(ranks: Ranks, value: float, column: int) -> None:
+    _, scheme, state = start(discs(), ranks)
+    node = int(scheme.active.nodes[41])
+    state.u[node, column] = value
+    with pytest.raises(RunError, match=f"node {node} at "):
+        check(scheme, state)
+
+
+def test_values_at_the_limits_pass(ranks: Ranks) -> None:
+    _, scheme, state = start(discs(), ranks)
+    check(scheme, state)
+    state.u[3, 0], state.u[4, 0], state.u[5, 1] = 1.5, -0.5, 1.5
+    check(scheme, state)

@@ -20,7 +20,7 @@ import numpy as np
 
 from . import checkpoint, output, slots
 from .arrays import Floats
-from .case import Case, CaseError, load_case
+from .case import Case, CaseError, Problem, load_case
 from .checkpoint import CheckpointError
 from .geometry import Mesh, MeshError
 from .integrators import RELAX_EVERY, Chebyshev, Integrator
@@ -123,6 +123,8 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:
     if not fresh:
         return load_case(directory / "case.json")
     case = load_case(arguments.case)
+    if case.particles.source == "packing":
+        raise CaseError([Problem("particles.source", "packing", "is not there yet; allowed: list, file")])
     (directory / "case.json").write_text(case.resolved_json())
     return case
 

@@ -37,6 +37,24 @@ PAIR: Case = {
     "output": {"history_every": 0.001, "snapshots": [0.0, 0.0035, 0.01]},
 }
 
+# The solver waits for a signal after the given steps; see `held_at` and `until_held`.
+HELD = """
+import sys, time
+from frit.solver import __main__ as solver
+
+after_step, steps = solver.Recorder.after_step, {steps}
+
+def hold(self, scheme, state, integrator):
+    if state.step in steps:
+        (self.directory / f"{self.ranks.rank}.{state.step}").touch()
+        while not (self.requests.checkpoint or self.requests.end):
+            time.sleep(0.005)
+    return after_step(self, scheme, state, integrator)
+
+solver.Recorder.after_step = hold
+sys.exit(solver.main())
+"""
+
 
 class Tree:
     """An mpirun and all that it starts; leaving the `with` block kills what is left."""
@@ -134,6 +152,29 @@ def finish(tree: Tree, directory: Path) -> None:
     status, printed = tree.ended()
     assert status == 0, printed
     assert record(directory)["state"] == "done"
+
+
+def held_at(*steps: int) -> str:
+    """The solver's script, which waits for a signal after these steps."""
+    return HELD.replace("{steps}", str(steps))
+
+
+def until_held(tree: Tree, directory: Path, ranks: int, where: object) -> None:
+    """Wait until all ranks wait: the file "<rank>.<step>" in the run directory tells that they do."""
+    tree.until(lambda: all((directory / f"{rank}.{where}").exists() for rank in range(ranks)))
+
+
+def interrupted(
+    case: Case, directory: Path, ranks: int = 1, step: int = 17, number: signal.Signals = signal.SIGTERM
+) -> Path:
+    """A run that got a signal after the step, and ended as it should."""
+    with launch(case, directory, ranks, held_at(step)) as tree:
+        until_held(tree, directory, ranks, step)
+        tree.process.send_signal(number)
+        _, printed = tree.ended()
+        assert tree.gone()
+    assert record(directory)["state"] == "interrupted", printed
+    return directory
 
 
 # --- what a run directory holds

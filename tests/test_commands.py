@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from launching import PAIR, TIMEOUT, different, history, record, snapshots
+from launching import PAIR, TIMEOUT, different, history, interrupted, record
 
 # On a terminal it becomes that of its session, as a shell's would be.
 FRIT = """
@@ -146,43 +146,33 @@ def test_a_run_that_fails_ends_with_1_and_the_reason(folder: Path) -> None:
         assert words in err
 
 
-def test_ctrl_c_and_resume(folder: Path) -> None:
-    """INT to frit alone: 130, a checkpoint, and the way to go on; then `resume` on the same ranks does, and TERM ends
-    it as well."""
+def test_ctrl_c_ends_with_130_and_the_way_to_go_on(folder: Path) -> None:
+    """INT to frit alone, as from another program."""
     directory = folder / "long"
-    with started(
-        folder, "run", "endless.json", "--ranks", "2", "--out", "long", stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    arguments = ("run", "endless.json", "--ranks", "2", "--out", "long")
+    with started(folder, *arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         until_rows(directory, process, 3)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 130
     assert "interrupted" in out
     assert "`frit resume long` goes on" in err
-    rows = history(directory)
-    assert len(rows) >= 3
-
-    with started(folder, "resume", "long", "--json", stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        until_rows(directory, process, len(rows) + 2)
-        process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=TIMEOUT)
-    assert (process.returncode, record(directory)["ranks"]) == (130, 2)
-    assert json.loads(out)["state"] == "interrupted"
-    again = history(directory)
-    assert again[: len(rows)] == rows
-    assert [row["time"] for row in again] == [k * 0.001 for k in range(len(again))]
+    assert record(directory)["state"] == "interrupted"
+    assert [row["time"] for row in history(directory)] == [k * 0.001 for k in range(len(history(directory)))]
 
 
 def test_resume_ends_like_an_undisturbed_run(folder: Path) -> None:
-    """The run directory of pair.toml, taken back to its first checkpoint by stopping it at once."""
-    with started(folder, "run", "pair.toml", "--out", "cut", stdout=subprocess.DEVNULL) as process:
-        until_rows(folder / "cut", process, 1)
-        process.send_signal(signal.SIGINT)
-        process.wait(TIMEOUT)
-    status, _, err = frit(folder, "resume", "cut")
-    assert status == 0, err
-    assert different(folder / "runs/pair", folder / "cut", 1e-12) == {}
-    assert snapshots(folder / "cut")["time"].tolist() == [0.0, 0.0035, 0.01]
+    """On as many ranks as before, without being told."""
+    cut = interrupted(PAIR, folder / "cut", ranks=2)
+    status, out, err = frit(folder, "resume", "cut", "--json")
+    assert (status, err) == (0, "")
+    assert {key: json.loads(out)[key] for key in ("state", "steps", "directory")} == {
+        "state": "done",
+        "steps": 100,
+        "directory": "cut",
+    }
+    assert record(cut)["ranks"] == 2
+    assert different(folder / "runs/pair", cut, 1e-10) == {}  # see test_ranks.py
 
 
 def test_progress_on_a_terminal(folder: Path) -> None:
@@ -217,3 +207,16 @@ def test_schema_describes_the_case_that_runs(folder: Path) -> None:
         if isinstance(values, dict):
             properties = schema["$defs"][schema["properties"][table]["$ref"].rpartition("/")[2]]["properties"]
             assert set(values) <= set(properties)
+
+
+def test_a_packing_to_be_made_is_refused(tmp_path: Path) -> None:
+    """The schema knows packings, the solver cannot make them yet: it says so instead of running anything."""
+    case = tmp_path / "packing.toml"
+    case.write_text(
+        '[domain]\nsize = [60.0, 40.0]\n[nodes]\nsource = "lattice"\nspacing = 1.0\n[time]\nend = 1.0\n'
+        '[particles]\nsource = "packing"\nmean_radius = 5.0\ncount = 5\ncontainer = [[5.0, 5.0], [55.0, 35.0]]\n'
+    )
+    command = [sys.executable, "-P", "-m", "frit.solver", str(case), "--out", str(tmp_path / "out")]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 2
+    assert "particles.source = 'packing': is not there yet; allowed: list, file" in ended.stderr

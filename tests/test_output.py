@@ -12,7 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from launching import PAIR, Case, Tree, different, history, launch, record, relative, snapshots, solve, write_case
+from launching import (
+    PAIR,
+    Case,
+    Tree,
+    different,
+    held_at,
+    history,
+    launch,
+    record,
+    relative,
+    snapshots,
+    solve,
+    until_held,
+    write_case,
+)
 
 from frit.solver import output
 from frit.solver.case import load_case, parse_case
@@ -39,23 +53,6 @@ SMALL_CHUNKS = """
 import sys
 from frit.solver import __main__ as solver
 solver.output.BLOCK = 37
-sys.exit(solver.main())
-"""
-
-# The first solver waits at step 50 until it is told to end.
-HELD = """
-import sys, time
-from frit.solver import __main__ as solver
-
-after_step = solver.Recorder.after_step
-
-def hold(self, scheme, state, integrator):
-    while state.step == 50 and not self.requests.end:
-        (self.directory / "held").touch()
-        time.sleep(0.005)
-    return after_step(self, scheme, state, integrator)
-
-solver.Recorder.after_step = hold
 sys.exit(solver.main())
 """
 
@@ -311,8 +308,8 @@ def test_a_second_solver_is_refused_and_touches_nothing(tmp_path: Path) -> None:
     """Fresh or resumed, on any number of ranks, and even with a case that is refused itself."""
     directory = tmp_path / "run"
     wrong: Case = PAIR | {"time": {"end": -1.0}}
-    with launch(PAIR, directory, script=HELD) as tree:
-        tree.until((directory / "held").exists)
+    with launch(PAIR, directory, script=held_at(50)) as tree:
+        until_held(tree, directory, 1, 50)
         before = content(directory)
         assert "another process is running here" in refused("--resume", directory)
         assert "another process is running here" in refused(directory.with_suffix(".json"), "--out", directory, ranks=2)

@@ -9,7 +9,22 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from launching import PAIR, Case, Tree, different, finish, history, launch, record, resume, solve, write_case
+from launching import (
+    PAIR,
+    Case,
+    Tree,
+    different,
+    finish,
+    held_at,
+    history,
+    interrupted,
+    launch,
+    record,
+    resume,
+    solve,
+    until_held,
+    write_case,
+)
 
 # Sums of the same terms, but a loop that starts at another address may add them in another order.
 SAME = 1e-12
@@ -25,25 +40,7 @@ CASES: dict[str, Case] = {
     "carried": ADAPTIVE | {"activation": {"enabled": False, "few_order_parameters": False}},
 }
 
-# The solver waits for a signal after the given steps; "<rank>.<step>" in the run directory tells that it does.
-HELD = """
-import sys, time
-from frit.solver import __main__ as solver
-
-after_step, steps = solver.Recorder.after_step, {steps}
-
-def hold(self, scheme, state, integrator):
-    if state.step in steps:
-        (self.directory / f"{self.ranks.rank}.{state.step}").touch()
-        while not (self.requests.checkpoint or self.requests.end):
-            time.sleep(0.005)
-    return after_step(self, scheme, state, integrator)
-
-solver.Recorder.after_step = hold
-sys.exit(solver.main())
-"""
-
-# The same before there is a mesh; it waits until all signals it may get have come.
+# The solver waits before there is a mesh, as `launching.held_at` does later, until all signals it may get have come.
 STARTING = """
 import sys, time
 from pathlib import Path
@@ -72,24 +69,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Every case, undisturbed, on one rank."""
     folder = tmp_path_factory.mktemp("whole")
     return {name: solve(case, folder / name) for name, case in CASES.items()}
-
-
-def held(tree: Tree, directory: Path, ranks: int, where: object) -> None:
-    """Wait until all ranks wait."""
-    tree.until(lambda: all((directory / f"{rank}.{where}").exists() for rank in range(ranks)))
-
-
-def interrupted(
-    case: Case, directory: Path, ranks: int = 1, step: int = 17, number: signal.Signals = signal.SIGTERM
-) -> Path:
-    """A run that got a signal in the step."""
-    with launch(case, directory, ranks, HELD.replace("{steps}", str([step]))) as tree:
-        held(tree, directory, ranks, step)
-        tree.process.send_signal(number)
-        _, printed = tree.ended()
-        assert tree.gone()
-    assert record(directory)["state"] == "interrupted", printed
-    return directory
 
 
 def checkpoint_step(directory: Path) -> int:
@@ -123,11 +102,11 @@ def test_another_number_of_ranks_goes_on(tmp_path: Path, whole: dict[str, Path],
 
 def test_usr1_writes_a_checkpoint_and_the_run_goes_on(tmp_path: Path, whole: dict[str, Path]) -> None:
     directory = tmp_path / "run"
-    with launch(PAIR, directory, script=HELD.replace("{steps}", "[20, 60]")) as tree:
-        held(tree, directory, 1, 20)
+    with launch(PAIR, directory, script=held_at(20, 60)) as tree:
+        until_held(tree, directory, 1, 20)
         assert checkpoint_step(directory) == 0
         tree.process.send_signal(signal.SIGUSR1)
-        held(tree, directory, 1, 60)
+        until_held(tree, directory, 1, 60)
         assert checkpoint_step(directory) == 20
         assert record(directory)["state"] == "running"
         tree.process.send_signal(signal.SIGUSR1)
@@ -140,7 +119,7 @@ def test_usr1_writes_a_checkpoint_and_the_run_goes_on(tmp_path: Path, whole: dic
     ("number", "ranks"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)], ids=["INT-1", "INT-2", "TERM-2"]
 )
 def test_int_and_term_end_with_a_checkpoint(tmp_path: Path, number: signal.Signals, ranks: int) -> None:
-    directory = interrupted(PAIR, tmp_path / "run", ranks, 20, number)
+    directory = interrupted(PAIR, tmp_path / "run", ranks, step=20, number=number)
     assert checkpoint_step(directory) == 20
     assert "checkpoint at t = 0.002" in record(directory)["message"]
     assert [row["step"] for row in history(directory)] == [0, 10, 20]
@@ -161,7 +140,7 @@ def test_signals_before_the_first_step_are_heard(tmp_path: Path, whole: dict[str
     """A checkpoint asked for is no reason to die, and an end asked for still leaves something to resume."""
     directory = tmp_path / "run"
     with launch(PAIR, directory, ranks=2, script=STARTING) as tree:
-        held(tree, directory, 2, "start")
+        until_held(tree, directory, 2, "start")
         tree.process.send_signal(signal.SIGUSR1)
         tree.process.send_signal(signal.SIGTERM)
         _, printed = tree.ended()

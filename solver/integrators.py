@@ -100,8 +100,8 @@ MARGIN = 1.2  # factor on an estimate of the spectral radius
 class Chebyshev:
     """Runge-Kutta-Chebyshev of order 2 with error control (Sommeijer, Shampine & Verwer 1997).
 
-    s stages are stable for dt |lambda| < 0.65 (s^2 - 1) on the negative real axis: the cost of a step grows with the square
-    root of its length. The error of a step is estimated from its end points; steps aim at `tolerance` in the
+    s stages are stable for dt |lambda| < 0.65 (s^2 - 1) on the negative real axis: the cost of a step grows with the
+    square root of its length. The error of a step is estimated from its end points; steps aim at `tolerance` in the
     volume-weighted root mean square of e / (1 + |u|) over the nodes that change.
     """
 

@@ -51,4 +51,4 @@ $(LISTED): pyproject.toml | $(BIN)/python
 	touch $@
 
 clean:
-	rm -rf runs build *.egg-info
+	rm -rf runs

@@ -43,7 +43,7 @@ class Active:
 
     def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
         """Largest movement of a watched value, in units of its eps: at 1 the set must be made anew."""
-        slot = 0.1 * LEAST * eps_eta
+        slot = 0.04 * LEAST * eps_eta
         return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta, slot))
 
 

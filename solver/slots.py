@@ -20,9 +20,11 @@ class SlotError(RuntimeError):
 
 
 def unique_pairs(pairs: Integers) -> Integers:
-    """The distinct rows (a, b) with a < b, sorted; (pairs, 2)."""
-    ordered = np.sort(pairs.reshape(-1, 2), axis=1)
-    return np.unique(ordered[(ordered[:, 0] >= 0) & (ordered[:, 0] < ordered[:, 1])], axis=0)
+    """The distinct rows (a, b) with a < b, sorted; rows with a negative number are none; (pairs, 2)."""
+    rows = pairs.reshape(-1, 2)
+    rows = rows[(rows[:, 0] >= 0) & (rows[:, 1] >= 0) & (rows[:, 0] != rows[:, 1])]
+    codes = np.unique(rows.min(axis=1) << 32 | rows.max(axis=1))
+    return np.stack([codes >> 32, codes & 0xFFFFFFFF], axis=1)
 
 
 def colour(pairs: Integers, particles: int) -> Numbers:

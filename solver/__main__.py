@@ -23,7 +23,7 @@ from .arrays import Floats
 from .case import Case, CaseError, Problem, load_case
 from .checkpoint import CheckpointError
 from .geometry import Mesh, MeshError
-from .integrators import RELAX_EVERY, Chebyshev, Integrator
+from .integrators import Integrator
 from .observe import Observables
 from .partition import Collector, Ranks, mpi_library
 from .prepare import build_mesh, make_integrator, prepare
@@ -179,7 +179,7 @@ class Recorder:
         wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
         due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
         self._show(scheme, state)
-        self.waited = 0 if traceless(integrator) or not (due or asked or stop) else self.waited + 1
+        self.waited = 0 if integrator.traceless or not (due or asked or stop) else self.waited + 1
         if 0 < self.waited <= LONGEST_WAIT:
             return False
         if (due or asked) and not stop:
@@ -222,11 +222,6 @@ class Recorder:
             "remaining": (end - state.time) / speed if speed > 0.0 else None,
         }  # fmt: skip
         print(json.dumps(line), flush=True)
-
-
-def traceless(integrator: Integrator) -> bool:
-    """Whether the next step rests on nothing but the state and `memory`: not on an earlier rate or stiffness."""
-    return not isinstance(integrator, Chebyshev) or not integrator.fresh or integrator.age % RELAX_EVERY == 0
 
 
 def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:

@@ -3,7 +3,7 @@
 A point is live where |grad rho| >= eps_rho or any |grad eta| >= eps_eta (section 2.4). Switching a point off must not
 change its neighbours: it shares nodes with live points, and those nodes need its part of W (24) and of the advection
 (20), (21). Both are computed once, when the set is made, and hold as long as the shared nodal values stand still.
-`Active.stale` watches exactly those values; the set is made anew when one has moved by more than eps.
+`Active.stale` watches exactly those values; the set is made anew when one has moved by `run.LAG` eps.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Active:
     watch: Integers  # (n,) which of their fields, see `kernels.watch_nodes`
 
     def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
-        """Largest movement of a watched value, in units of its eps: at 1 the set must be made anew."""
+        """Largest movement of a watched value, in units of its eps; `run.LAG` says when it is too much."""
         slot = 0.04 * LEAST * eps_eta
         return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta, slot))
 
@@ -97,7 +97,8 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
     """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks.
 
     Particles that clash move to other slots until none does. What has been seen to meet stays known, so this ends.
-    Where the particles then need fewer packs of slots than there are, all are dealt out anew.
+    Where the particles then need fewer packs of slots than there are, all are dealt out anew. The end is a fixed point:
+    choosing again for the same state gives the same.
     """
     known = np.empty((0, 2), dtype=np.int64)
     compact = True
@@ -109,10 +110,11 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             owner[:] = np.arange(owner.shape[1], dtype=np.int32)
             return flags, owner
         claims, clashes = _claim(d, state, owner, clash)
-        met = slots.meeting(claims, np.arange(d.nodes))
-        held = slots.meeting(state.owner, np.arange(d.nodes))
-        known = _everyones_pairs(d, np.concatenate([known, held, met, clashes]))
         clashes = _everyones_pairs(d, clashes)
+        if len(clashes) or state.u.shape[1] > LANES:
+            every = np.arange(d.nodes)
+            seen = [known, clashes, slots.meeting(claims, every), slots.meeting(state.owner, every)]
+            known = _everyones_pairs(d, np.concatenate(seen))
         slot_of = state.slot_of
         if len(clashes):
             slot_of = slots.recolour(slot_of, known)

@@ -35,6 +35,10 @@ class Integrator(Protocol):
     def memory(self) -> dict[str, float]:
         """Numbers to keep in a checkpoint."""
 
+    @property
+    def traceless(self) -> bool:
+        """Whether the next step rests on nothing but the state and `memory`: not on an earlier rate or stiffness."""
+
 
 def paper_step(shortest: float, case: Case) -> float:
     """dt = 0.1 d_min^2 / (2 L kappa_eta), d_min the smallest distance between nodes: the paper's rule (2.3)."""
@@ -87,6 +91,11 @@ class RK2:
         """Nothing: the step is fixed."""
         return {}
 
+    @property
+    def traceless(self) -> bool:
+        """Always."""
+        return True
+
 
 SAFETY = 0.8
 GROWTH = 5.0  # largest factor between two steps
@@ -128,6 +137,11 @@ class Chebyshev:
             "dt": self.dt, "radius": self.radius, "age": self.age,
             "error_before": self.error_before, "dt_before": self.dt_before,
         }  # fmt: skip
+
+    @property
+    def traceless(self) -> bool:
+        """Before a step that measures the rate and the contacts' stiffness anew."""
+        return not self.fresh or self.age % RELAX_EVERY == 0
 
     def restart(self, scheme: Scheme, state: State) -> None:
         """Fit the work arrays to the state and forget the last rate."""

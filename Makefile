@@ -9,7 +9,7 @@ CASE ?= sweeps/cases/pack.toml
 OUT ?= runs/$(basename $(notdir $(CASE)))
 
 # Installed as a strict editable package: a new or removed file asks for a new install, an edited one does not.
-FILES := $(sort $(wildcard solver/*.py service/*.py sweeps/*.py))
+FILES := $(sort $(shell find solver service sweeps -name '*.py'))
 LISTED := $(VENV)/.files-$(shell echo "$(FILES)" | cksum | cut -d' ' -f1)
 
 .PHONY: run test slow lint bench setup clean

@@ -1,0 +1,160 @@
+"""Jobs: their states, one sentence each, the moves between them, and the records that travel through the service."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+
+class State(StrEnum):
+    """What a job is doing. A job in ERROR or LOST goes back to QUEUED while it has attempts left."""
+
+    QUEUED = "queued"
+    STARTING = "starting"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    ERROR = "error"
+    CANCELLED = "cancelled"
+    TIMED_OUT = "timed_out"
+    LOST = "lost"
+
+    @property
+    def sentence(self) -> str:
+        """What it means, for people."""
+        return SENTENCES[self]
+
+    @property
+    def active(self) -> bool:
+        """Whether it has cores."""
+        return self in (State.STARTING, State.RUNNING)
+
+
+SENTENCES: Mapping[State, str] = {
+    State.QUEUED: "Accepted and durable; waits for cores.",
+    State.STARTING: "Has been given cores; its runner is on the way up.",
+    State.RUNNING: "Its runner lives and has recorded itself in the run directory.",
+    State.SUCCEEDED: "The solver reached the end of the case.",
+    State.FAILED: "The solver said no, and would say so again: a refused case, or fields that lost their meaning.",
+    State.ERROR: "The machinery broke; it is tried again from the last checkpoint while attempts are left.",
+    State.CANCELLED: "Somebody asked for its end; what it had computed is kept in a checkpoint.",
+    State.TIMED_OUT: "It used up its time limit; what it had computed is kept in a checkpoint.",
+    State.LOST: "Its runner vanished without an exit record; it is tried again while attempts are left.",
+}
+
+
+class Move(StrEnum):
+    """What can happen to a job. The second half is what an exit record, or its absence, says."""
+
+    CLAIM = "claim"  # the scheduler gives it cores
+    START = "start"  # the runner has recorded itself
+    CANCEL = "cancel"  # somebody asks for the end of a job that has no cores
+    RETRY = "retry"  # somebody asks for another attempt
+    REQUEUE = "requeue"  # the pause after ERROR or LOST is over
+    RELEASE = "release"  # the runner was asked to stop for now
+    SUCCEED = "succeed"
+    FAIL = "fail"
+    BREAK = "break"
+    TIME_OUT = "time_out"
+    STOP = "stop"  # the runner obeyed a cancel
+    LOSE = "lose"
+
+
+def _ends(state: State) -> dict[tuple[State, Move], State]:
+    ends = {
+        Move.RELEASE: State.QUEUED,
+        Move.SUCCEED: State.SUCCEEDED,
+        Move.FAIL: State.FAILED,
+        Move.BREAK: State.ERROR,
+        Move.TIME_OUT: State.TIMED_OUT,
+        Move.STOP: State.CANCELLED,
+        Move.LOSE: State.LOST,
+    }
+    return {(state, move): end for move, end in ends.items()}
+
+
+TRANSITIONS: Mapping[tuple[State, Move], State] = {
+    (State.QUEUED, Move.CLAIM): State.STARTING,
+    (State.QUEUED, Move.CANCEL): State.CANCELLED,
+    (State.STARTING, Move.START): State.RUNNING,
+    **_ends(State.STARTING),
+    **_ends(State.RUNNING),
+    **{(state, Move.REQUEUE): State.QUEUED for state in (State.ERROR, State.LOST)},
+    **{(state, Move.CANCEL): State.CANCELLED for state in (State.ERROR, State.LOST)},
+    **{
+        (state, Move.RETRY): State.QUEUED
+        for state in (State.FAILED, State.ERROR, State.CANCELLED, State.TIMED_OUT, State.LOST)
+    },
+}
+
+
+class TransitionError(ValueError):
+    """A move that the job's state does not allow."""
+
+    def __init__(self, state: State, move: Move) -> None:
+        self.state, self.move = state, move
+        allowed = ", ".join(before for before, m in TRANSITIONS if m == move)
+        super().__init__(f"state = {state!r}: {move} is possible only from {allowed}")
+
+
+def after(state: State, move: Move) -> State:
+    """The state a move leads to. Raises `TransitionError`."""
+    try:
+        return TRANSITIONS[state, move]
+    except KeyError:
+        raise TransitionError(state, move) from None
+
+
+@dataclass(frozen=True, slots=True)
+class NewJob:
+    """What a submission asks for; `case` is the resolved case as compact JSON, `identity` its hash."""
+
+    case: str
+    identity: str
+    name: str
+    ranks: int = 1
+    priority: int = 0
+    tags: tuple[str, ...] = ()
+    time_limit: float | None = None  # wall-clock seconds of one attempt
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A row of the index. Times are seconds since 1970; `seq` is the order of submission."""
+
+    seq: int
+    id: str
+    name: str
+    identity: str
+    state: State
+    message: str | None
+    priority: int
+    ranks: int
+    tags: tuple[str, ...]
+    time_limit: float | None
+    attempt: int  # number of the present or last attempt; 0 before the first
+    failures: int  # attempts in a row that broke or were lost
+    retrying: bool  # in ERROR or LOST: another attempt follows by itself
+    stopping: bool  # somebody asked for the end of a job that has cores
+    created: float
+    started: float | None
+    ended: float | None
+    core_seconds: float | None  # of all attempts
+    result: dict[str, Any]  # scalars of the last history row; `packing`: what was realised
+    case: str
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing more happens by itself."""
+        return self.state not in (State.QUEUED, State.STARTING, State.RUNNING) and not self.retrying
+
+
+@dataclass(frozen=True, slots=True)
+class Exit:
+    """How an attempt ended: the runner's exit record (`move` is one of the ends)."""
+
+    attempt: int
+    move: Move
+    message: str | None
+    ended: float
+    core_seconds: float = 0.0

@@ -1,0 +1,66 @@
+"""Versions of the index. An empty one is made by whoever opens it; an old one waits for `frit db upgrade`."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+
+
+class IndexVersionError(RuntimeError):
+    """The index is of another version than this frit's, or no index at all."""
+
+
+def configuration(path: Path) -> Config:
+    """alembic's, without a file of its own."""
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent))
+    config.set_main_option("path_separator", "os")
+    config.attributes["path"] = path
+    return config
+
+
+def versions(path: Path) -> tuple[str | None, str]:
+    """The version of the index at `path` (None: empty or not there), and this frit's."""
+    newest = ScriptDirectory.from_config(configuration(path)).get_current_head()
+    assert newest is not None  # narrows the type: there is a first migration
+    if not path.exists():
+        return None, newest
+    try:
+        with sa.create_engine(f"sqlite:///{path}", poolclass=sa.NullPool).connect() as connection:
+            present = MigrationContext.configure(connection).get_current_revision()
+            if present is None and sa.inspect(connection).get_table_names():
+                raise IndexVersionError(f"{path}: a database, but not an index of frit")
+            return present, newest
+    except sa.exc.DatabaseError as error:
+        if isinstance(error.orig, sqlite3.OperationalError):
+            raise IndexVersionError(f"{path}: cannot be opened: {error.orig}") from error
+        raise IndexVersionError(f"{path}: not a database: {error.orig}") from error
+
+
+def prepare(path: Path) -> None:
+    """Make an empty index; refuse one of another version. Raises `IndexVersionError`."""
+    present, newest = versions(path)
+    if present is None:
+        upgrade(path)
+    elif present != newest:
+        known = {script.revision for script in ScriptDirectory.from_config(configuration(path)).walk_revisions()}
+        way = f"`frit db upgrade --data {path.parent}`" if present in known else "a newer frit made it: use that one"
+        raise IndexVersionError(f"{path}: version {present}, this frit needs {newest}: {way}")
+
+
+def upgrade(path: Path) -> Path | None:
+    """Bring the index to this frit's version in one transaction; an older one is copied first: where to, if so."""
+    present, newest = versions(path)
+    copy = None
+    if present is not None and present != newest:
+        copy = path.with_name(f"{path.name}.{present}")
+        with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(copy)) as target:
+            source.backup(target)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    command.upgrade(configuration(path), "head")
+    return copy

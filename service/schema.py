@@ -1,0 +1,130 @@
+"""The tables of the index. A change here needs a migration in migrations/versions; a test compares the two."""
+
+from sqlalchemy import JSON, Boolean, Column, Float, ForeignKey, Index, Integer, MetaData, String, Table, Text, text
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_N_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+sweeps = Table(
+    "sweeps",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("name", Text, nullable=False),
+    Column("definition", Text, nullable=False),  # JSON, as `Sweep.resolved_json` gives it
+    Column("duplicates", Integer, nullable=False, server_default="0"),
+    Column("created", Float, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("name", Text, nullable=False),
+    Column("identity", String, nullable=False, index=True),
+    Column("state", String, nullable=False),
+    Column("message", Text),
+    Column("priority", Integer, nullable=False),
+    Column("ranks", Integer, nullable=False),
+    Column("tags", JSON, nullable=False),
+    Column("time_limit", Float),
+    Column("attempt", Integer, nullable=False),
+    Column("failures", Integer, nullable=False),
+    Column("retrying", Boolean, nullable=False),
+    Column("stopping", Boolean, nullable=False),
+    Column("created", Float, nullable=False),
+    Column("started", Float),
+    Column("ended", Float),
+    Column("core_seconds", Float),
+    Column("result", JSON, nullable=False),
+    Column("case", Text, nullable=False),  # the resolved case, compact JSON
+    sqlite_autoincrement=True,
+)
+Index("ix_jobs_queue", jobs.c.state, jobs.c.priority.desc(), jobs.c.seq)
+Index("ix_jobs_state_seq", jobs.c.state, jobs.c.seq)
+for key in ("mean_radius", "std_radius", "packing_density"):  # what sweeps are made of
+    Index(f"ix_jobs_{key}", text(f"""json_extract("case", '$.particles.{key}')"""))
+
+sweep_jobs = Table(
+    "sweep_jobs",
+    metadata,
+    Column("sweep", ForeignKey(sweeps.c.seq), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("job", ForeignKey(jobs.c.seq), nullable=False, index=True),
+    Column("name", Text, nullable=False),
+    Column("parameters", JSON, nullable=False),
+)
+
+attempts = Table(
+    "attempts",
+    metadata,
+    Column("job", ForeignKey(jobs.c.seq), primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("cores", JSON, nullable=False),
+    Column("claimed", Float, nullable=False),
+    Column("pid", Integer),
+    Column("pid_start", Integer),  # clock ticks after boot: with the boot's id it tells a reused pid
+    Column("boot", String),
+    Column("ended", Float),
+    Column("state", String),
+    Column("message", Text),
+    Column("core_seconds", Float),
+)
+
+history = Table(
+    "history",
+    metadata,
+    Column("job", ForeignKey(jobs.c.seq), primary_key=True),
+    Column("row", Integer, primary_key=True),
+    Column("time", Float, nullable=False),
+    Column("vacancy_ratio", Float),
+    Column("data", Text, nullable=False),  # the row as the solver wrote it
+)
+
+snapshots = Table(
+    "snapshots",
+    metadata,
+    Column("job", ForeignKey(jobs.c.seq), primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("time", Float, nullable=False),
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("job", ForeignKey(jobs.c.seq), nullable=False),
+    Column("at", Float, nullable=False),
+    Column("state", String, nullable=False),
+    Column("message", Text),
+    Index("ix_events_job_seq", "job", "seq"),
+    sqlite_autoincrement=True,
+)
+
+tokens = Table(
+    "tokens",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("name", Text, nullable=False, unique=True),
+    Column("hash", String, nullable=False, unique=True),  # SHA-256 of 256 random bits
+    Column("scope", String, nullable=False),
+    Column("created", Float, nullable=False),
+    Column("revoked", Float),
+)
+
+idempotency = Table(
+    "idempotency",
+    metadata,
+    Column("key", String, primary_key=True),
+    Column("fingerprint", String, nullable=False),
+    Column("resource", String, nullable=False),
+    Column("created", Float, nullable=False),
+)

@@ -1,0 +1,68 @@
+"""Settings of the service: from the environment (FRIT_...) and the command line, complete and checked at birth."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+AtLeastOne = Annotated[int, Field(ge=1)]
+Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+def own_cores() -> tuple[int, ...]:
+    """The processors that this process may use."""
+    return tuple(sorted(os.sched_getaffinity(0)))
+
+
+class Settings(BaseSettings):
+    """One frozen set for the life of a service."""
+
+    model_config = SettingsConfigDict(env_prefix="FRIT_", frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    data: Path = Path("data")
+    """folder of the index, the run directories and the uploaded files"""
+    cores: AtLeastOne = Field(default_factory=lambda: len(own_cores()))
+    """processors given to jobs; a job takes as many as it has ranks"""
+    host: str = "127.0.0.1"
+    """address to listen on; any but a loopback address needs tokens"""
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    """port to listen on; 0: any free one"""
+    attempts: AtLeastOne = 5
+    """attempts in a row that may break or get lost before a job stays in `error` or `lost`"""
+    backoff: Seconds = 2.0
+    """seconds before the second attempt; doubles with each one after"""
+    backoff_limit: Seconds = 300.0
+    """longest pause between two attempts, seconds"""
+    patience: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 60.0
+    """seconds for which smaller jobs may overtake the first in the queue while it waits for more cores"""
+    grace: Seconds = 60.0
+    """seconds for each step of the ladder checkpoint, end, kill when a job is stopped"""
+    poll: Seconds = 0.5
+    """seconds between two looks at what running jobs have written"""
+    free_disk: Annotated[int, Field(ge=0)] = 200_000_000
+    """bytes free in the data folder below which no job is started"""
+    body_limit: AtLeastOne = 20_000_000
+    """bytes of a request's body, at most"""
+    points_limit: AtLeastOne = 100_000
+    """points of a sweep, at most"""
+    nodes_limit: AtLeastOne = 20_000_000
+    """nodes of a case, at most"""
+    queue_limit: AtLeastOne = 200_000
+    """jobs waiting in the queue, at most"""
+
+    @property
+    def database(self) -> str:
+        """URL of the index."""
+        return f"sqlite:///{self.data.absolute() / 'frit.db'}"
+
+    @property
+    def runs(self) -> Path:
+        """Parent of the run directories."""
+        return self.data.absolute() / "runs"
+
+    def pause(self, failures: int) -> float:
+        """Seconds before the next attempt after that many failures in a row."""
+        doublings = min(max(failures - 1, 0), 60)
+        return float(min(self.backoff * 2.0**doublings, self.backoff_limit))

@@ -1,0 +1,709 @@
+"""The only file that opens the database: every transaction begins and ends here.
+
+One thread writes, over one connection, which is also the only one that moves the write-ahead log into the database.
+It takes all that waits for it into one transaction, each piece in a savepoint of its own, and answers once that is
+on the disk: what is acknowledged is durable, and many requests share one flush. Readers' connections cannot write.
+"""
+
+import json
+import os
+import queue
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Engine, Row
+from sqlalchemy.exc import DBAPIError
+
+from . import migrations
+from .jobs import Exit, Job, Move, NewJob, State, after
+from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps, tokens
+
+BATCH = 256  # pieces of work in one transaction, at most
+BUSY = 5.0  # seconds to wait for a lock that another program holds
+T = TypeVar("T")
+
+
+class StoreError(RuntimeError):
+    """The index cannot be used now; nothing was changed. The message says why."""
+
+
+class NotFoundError(LookupError):
+    """There is no such job, sweep or token."""
+
+
+class KeyReusedError(ValueError):
+    """An idempotency key that came before, with another request."""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """An idempotency key: `scope` keeps one user's and one route's keys apart, `fingerprint` tells the request."""
+
+    scope: str
+    value: str
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRecord:
+    """A sweep: `states` counts its jobs; of its points `duplicates` were the same case as an earlier one."""
+
+    seq: int
+    id: str
+    name: str
+    definition: str
+    duplicates: int
+    created: float
+    points: int
+    states: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepPoint:
+    """A job in a sweep: its place, its name there, and the values of the sweep's axes."""
+
+    position: int
+    name: str
+    parameters: dict[str, Any]
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class NewPoint:
+    """A point of a sweep to be submitted."""
+
+    job: NewJob
+    parameters: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A change of state; `seq` grows."""
+
+    seq: int
+    at: float
+    state: State
+    message: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One try at a job: the cores it had, and its runner's process once that has recorded itself."""
+
+    job: str
+    number: int
+    cores: tuple[int, ...]
+    claimed: float
+    pid: int | None
+    pid_start: int | None
+    boot: str | None
+    ended: float | None
+    state: str | None
+    message: str | None
+    core_seconds: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """A token as it is kept: never the secret itself."""
+
+    name: str
+    scope: str
+    created: float
+    revoked: float | None
+
+
+@dataclass
+class Transaction:
+    """What one piece of work sees: the connection, and the journal lines it wants written with the commit."""
+
+    connection: Connection
+    lines: list[str] = field(default_factory=list)
+
+    def run(self, statement: sa.Executable, rows: Any = None) -> sa.CursorResult[Any]:
+        """Execute; `rows` for many at once."""
+        return cast("sa.CursorResult[Any]", self.connection.execute(statement, rows))
+
+    def note(self, **line: Any) -> None:
+        """A line of the journal: what a lost index is rebuilt from."""
+        self.lines.append(json.dumps({**line, "at": time.time()}) + "\n")
+
+
+@dataclass
+class _Work:
+    effect: Callable[[Transaction], Any]
+    answer: Future[Any]
+
+
+class Store:
+    """The index of one data folder. Methods that change it give a future, done once the change is durable."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open an up-to-date index; make it where there is none. Raises `StoreError`."""
+        self.path = folder.absolute() / "frit.db"
+        self.journal = folder.absolute() / "submitted.jsonl"
+        migrations.prepare(self.path)
+        self._writer = _engine(self.path, writer=True)
+        self._reader = _engine(self.path, writer=False)
+        self._waiting: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
+        self._closed = False
+        self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
+        self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Finish what waits, and close."""
+        if not self._closed:
+            self._closed = True
+            self._waiting.put(None)
+            self._thread.join()
+            self._writer.dispose()
+            self._reader.dispose()
+
+    # --- the writer ---------------------------------------------------------------------------------------
+
+    def write(self, effect: "Callable[[Transaction], T]") -> "Future[T]":
+        """Have the effect done in a transaction; the future is done when it is durable."""
+        if self._closed:
+            raise StoreError("the index is closed")
+        work = _Work(effect, Future())
+        self._waiting.put(work)
+        return work.answer
+
+    def _write(self) -> None:
+        while (work := self._waiting.get()) is not None:
+            batch: list[_Work | None] = [work]
+            while len(batch) < BATCH and not self._waiting.empty():
+                batch.append(self._waiting.get())
+            self._commit([work for work in batch if work is not None])
+            if batch[-1] is None:
+                return
+
+    def _commit(self, batch: Sequence[_Work]) -> None:
+        done: list[tuple[_Work, Any]] = []
+        refused: list[tuple[_Work, Exception]] = []
+        lines: list[str] = []
+        try:
+            with self._writer.connect() as connection, connection.begin():
+                for work in batch:
+                    try:
+                        with connection.begin_nested():
+                            transaction = Transaction(connection)
+                            done.append((work, work.effect(transaction)))
+                            lines += transaction.lines
+                    except DBAPIError:
+                        raise  # the whole database is in trouble
+                    except Exception as error:
+                        refused.append((work, error))
+            self._append(lines)
+        except (DBAPIError, OSError) as error:
+            trouble = StoreError(f"{self.path}: {getattr(error, 'orig', None) or error}")
+            trouble.__cause__ = error
+            for work in batch:
+                work.answer.set_exception(trouble)
+            return
+        for work, reason in refused:
+            work.answer.set_exception(reason)
+        for work, answer in done:
+            work.answer.set_result(answer)
+        for listener in self.listeners:
+            listener()
+
+    def _append(self, lines: Sequence[str]) -> None:
+        if lines:
+            with open(self.journal, "a", encoding="utf-8") as file:
+                file.write("".join(lines))
+                file.flush()
+                os.fsync(file.fileno())
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection that sees one moment of the database and cannot change it. Raises `StoreError`."""
+        try:
+            with self._reader.connect() as connection:
+                yield connection
+        except DBAPIError as error:
+            raise StoreError(f"{self.path}: {error.orig}") from error
+
+    # --- submitting ---------------------------------------------------------------------------------------
+
+    def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
+        """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
+
+        def effect(t: Transaction) -> Job:
+            if (known := _known(t, key)) is not None:
+                return _job(t.connection, known)
+            (row,) = _insert(t, [job])
+            _remember(t, key, row.id)
+            t.note(kind="job", id=row.id, name=job.name, ranks=job.ranks, priority=job.priority, tags=job.tags,
+                   time_limit=job.time_limit, case=job.case)  # fmt: skip
+            return row
+
+        return self.write(effect)
+
+    def submit_sweep(
+        self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
+    ) -> "Future[SweepRecord]":
+        """Queue the points of a sweep that no job has yet; jobs of the same case that were not done are tried again."""
+
+        def effect(t: Transaction) -> SweepRecord:
+            if (known := _known(t, key)) is not None:
+                return _sweep(t.connection, known)
+            seq, identifier = _insert_sweep(t, name, definition, duplicates)
+            numbers = _jobs_of_points(t, points)
+            rows = [
+                {"sweep": seq, "position": i, "job": numbers[point.job.identity], "name": point.job.name,
+                 "parameters": dict(point.parameters)}
+                for i, point in enumerate(points)
+            ]  # fmt: skip
+            if rows:
+                t.run(sweep_jobs.insert(), rows)
+            _remember(t, key, identifier)
+            t.note(kind="sweep", id=identifier, name=name, definition=definition)
+            return _sweep(t.connection, identifier)
+
+        return self.write(effect)
+
+    # --- what happens to a job ----------------------------------------------------------------------------
+
+    def claim(self, choices: Sequence[tuple[int, tuple[int, ...]]]) -> "Future[list[Job]]":
+        """Give queued jobs (by seq) their cores. One that is not queued any more is left out."""
+
+        def effect(t: Transaction) -> list[Job]:
+            claimed = []
+            for seq, cores in choices:
+                job = _by_seq(t.connection, seq)
+                if job.state is not State.QUEUED:
+                    continue
+                now = time.time()
+                _move(t, job, Move.CLAIM, None, attempt=job.attempt + 1, started=job.started or now, ended=None)
+                row = {"job": seq, "number": job.attempt + 1, "cores": list(cores), "claimed": now}
+                t.run(attempts.insert(), [row])
+                claimed.append(_by_seq(t.connection, seq))
+            return claimed
+
+        return self.write(effect)
+
+    def start(self, identifier: str, attempt: int, pid: int, pid_start: int, boot: str) -> "Future[Job]":
+        """The runner of an attempt has recorded itself. Told twice it counts once."""
+
+        def effect(t: Transaction) -> Job:
+            job = _job(t.connection, identifier)
+            if (job.attempt, job.state) != (attempt, State.STARTING):
+                return job
+            which = (attempts.c.job == job.seq) & (attempts.c.number == attempt)
+            t.run(attempts.update().where(which).values(pid=pid, pid_start=pid_start, boot=boot))
+            return _move(t, job, Move.START, None)
+
+        return self.write(effect)
+
+    def finish(self, identifier: str, end: Exit, attempts_limit: int) -> "Future[Job]":
+        """An attempt has ended. Told twice, or of an attempt that is not the present one, it counts once."""
+
+        def effect(t: Transaction) -> Job:
+            job = _job(t.connection, identifier)
+            if job.attempt != end.attempt or not job.state.active:
+                return job
+            broke = end.move in (Move.BREAK, Move.LOSE)
+            failures = job.failures + 1 if broke else 0
+            state = after(job.state, end.move)
+            which = (attempts.c.job == job.seq) & (attempts.c.number == end.attempt)
+            t.run(
+                attempts.update().where(which).values(
+                    ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
+                )
+            )  # fmt: skip
+            retrying = broke and failures < attempts_limit and not job.stopping
+            if broke and job.stopping:  # nobody wants it any more
+                state, end_move = State.CANCELLED, Move.STOP
+            else:
+                end_move = end.move
+            return _move(
+                t, job, end_move, end.message, failures=failures, retrying=retrying, stopping=False,
+                ended=None if state is State.QUEUED else end.ended,
+                core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
+            )  # fmt: skip
+
+        return self.write(effect)
+
+    def requeue(self, identifier: str, attempt: int) -> "Future[Job]":
+        """The pause after a broken attempt is over."""
+
+        def effect(t: Transaction) -> Job:
+            job = _job(t.connection, identifier)
+            if job.attempt != attempt or not job.retrying:
+                return job
+            return _move(t, job, Move.REQUEUE, job.message, retrying=False)
+
+        return self.write(effect)
+
+    def cancel(self, identifier: str) -> "Future[Job]":
+        """End a job: at once where it has no cores, else it is marked and its runner must be told.
+
+        Raises `TransitionError` where it has ended already.
+        """
+
+        def effect(t: Transaction) -> Job:
+            job = _job(t.connection, identifier)
+            if job.state is State.CANCELLED:
+                return job
+            if job.state.active:
+                t.run(jobs.update().where(jobs.c.seq == job.seq).values(stopping=True))
+                return _by_seq(t.connection, job.seq)
+            if job.state in (State.ERROR, State.LOST) and not job.retrying:
+                after(State.SUCCEEDED if job.final else job.state, Move.CANCEL)
+            return _move(t, job, Move.CANCEL, None, retrying=False, ended=time.time())
+
+        return self.write(effect)
+
+    def retry(self, identifier: str) -> "Future[Job]":
+        """Queue a job that ended without success again; it goes on from its checkpoint. Raises `TransitionError`."""
+        return self.write(lambda t: _retry(t, _job(t.connection, identifier)))
+
+    def ingest(self, seq: int, rows: Sequence[tuple[int, str]], times: Sequence[tuple[int, float]]) -> "Future[None]":
+        """History rows (number, JSON line) and times of complete snapshots (number, time) of a job."""
+
+        def effect(t: Transaction) -> None:
+            if rows:
+                trees = [json.loads(line) for _, line in rows]
+                values = [
+                    {"job": seq, "row": number, "time": tree["time"], "vacancy_ratio": tree.get("vacancy_ratio"),
+                     "data": line}
+                    for (number, line), tree in zip(rows, trees, strict=True)
+                ]  # fmt: skip
+                t.run(history.insert().prefix_with("OR REPLACE"), values)
+            if times:
+                values = [{"job": seq, "number": number, "time": at} for number, at in times]
+                t.run(snapshots.insert().prefix_with("OR REPLACE"), values)
+
+        return self.write(effect)
+
+    def set_result(self, seq: int, result: Mapping[str, Any]) -> "Future[None]":
+        """The scalars by which finished jobs are found."""
+
+        def effect(t: Transaction) -> None:
+            t.run(jobs.update().where(jobs.c.seq == seq).values(result=dict(result)))
+
+        return self.write(effect)
+
+    # --- looking ------------------------------------------------------------------------------------------
+
+    def job(self, identifier: str) -> Job:
+        """By its id, or by the first characters of it where they suffice. Raises `NotFoundError`."""
+        with self.reading() as connection:
+            return _job(connection, identifier)
+
+    def jobs(
+        self, where: sa.ColumnElement[bool] | None = None, order: Sequence[Any] = (), limit: int = 50
+    ) -> list[Job]:
+        """Jobs that fit, newest first unless told otherwise."""
+        query = sa.select(jobs).order_by(*(order or (jobs.c.seq.desc(),))).limit(limit)
+        with self.reading() as connection:
+            return [_record(row) for row in connection.execute(query if where is None else query.where(where))]
+
+    def queued(self, limit: int) -> list[tuple[int, int]]:
+        """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
+        query = (
+            sa.select(jobs.c.seq, jobs.c.ranks).where(jobs.c.state == State.QUEUED)
+            .order_by(jobs.c.priority.desc(), jobs.c.seq).limit(limit)
+        )  # fmt: skip
+        with self.reading() as connection:
+            return [(row.seq, row.ranks) for row in connection.execute(query)]
+
+    def unfinished(self) -> tuple[list[tuple[Job, Attempt]], list[Job]]:
+        """Jobs that have cores with their present attempt, and jobs that wait for another attempt."""
+        active = jobs.c.state.in_([State.STARTING, State.RUNNING])
+        with self.reading() as connection:
+            held = [_record(row) for row in connection.execute(sa.select(jobs).where(active))]
+            waiting = [
+                _record(row)
+                for row in connection.execute(
+                    sa.select(jobs).where(jobs.c.state.in_([State.ERROR, State.LOST]), jobs.c.retrying)
+                )
+            ]
+            return [(job, _attempts(connection, job)[-1]) for job in held], waiting
+
+    def count(self, *states: State) -> int:
+        """Number of jobs in these states."""
+        with self.reading() as connection:
+            query = sa.select(sa.func.count()).select_from(jobs).where(jobs.c.state.in_(states))
+            return int(connection.execute(query).scalar_one())
+
+    def counts(self) -> dict[str, int]:
+        """Number of jobs by state."""
+        with self.reading() as connection:
+            found = connection.execute(sa.select(jobs.c.state, sa.func.count()).group_by(jobs.c.state)).all()
+        return {state: dict((s, n) for s, n in found).get(state, 0) for state in State}
+
+    def attempts(self, identifier: str) -> list[Attempt]:
+        """All attempts at a job, first to last."""
+        with self.reading() as connection:
+            return _attempts(connection, _job(connection, identifier))
+
+    def events(self, identifier: str, since: int = 0) -> list[Event]:
+        """Changes of a job's state after event number `since`."""
+        with self.reading() as connection:
+            seq = _job(connection, identifier).seq
+            query = sa.select(events).where(events.c.job == seq, events.c.seq > since).order_by(events.c.seq)
+            return [Event(row.seq, row.at, State(row.state), row.message) for row in connection.execute(query)]
+
+    def history(self, identifier: str, since: int = 0, limit: int | None = None) -> list[tuple[int, str]]:
+        """History rows (number, JSON) from number `since` on."""
+        with self.reading() as connection:
+            seq = _job(connection, identifier).seq
+            query = sa.select(history.c.row, history.c.data).where(history.c.job == seq, history.c.row >= since)
+            return [(row.row, row.data) for row in connection.execute(query.order_by(history.c.row).limit(limit))]
+
+    def snapshots(self, identifier: str) -> list[tuple[int, float]]:
+        """(number, time) of the complete snapshots."""
+        with self.reading() as connection:
+            seq = _job(connection, identifier).seq
+            query = sa.select(snapshots).where(snapshots.c.job == seq).order_by(snapshots.c.number)
+            return [(row.number, row.time) for row in connection.execute(query)]
+
+    def sweep(self, identifier: str) -> SweepRecord:
+        """By its id, or by its name: then the newest of that name. Raises `NotFoundError`."""
+        with self.reading() as connection:
+            return _sweep(connection, identifier)
+
+    def sweeps(self, before: int | None = None, limit: int = 50) -> list[SweepRecord]:
+        """Newest first; `before`: only those with a smaller seq."""
+        query = sa.select(sweeps.c.id).order_by(sweeps.c.seq.desc()).limit(limit)
+        with self.reading() as connection:
+            if before is not None:
+                query = query.where(sweeps.c.seq < before)
+            return [_sweep(connection, row.id) for row in connection.execute(query)]
+
+    def sweep_points(self, identifier: str) -> list[SweepPoint]:
+        """The jobs of a sweep in its own order."""
+        with self.reading() as connection:
+            seq = _sweep(connection, identifier).seq
+            named = sa.select(jobs, sweep_jobs.c.position, sweep_jobs.c.name.label("label"), sweep_jobs.c.parameters)
+            query = named.join_from(sweep_jobs, jobs).where(sweep_jobs.c.sweep == seq).order_by(sweep_jobs.c.position)
+            return [
+                SweepPoint(row.position, row.label, row.parameters, _record(row)) for row in connection.execute(query)
+            ]
+
+    def identities(self, which: Sequence[str]) -> dict[str, Job]:
+        """Of these identities, the newest job each has."""
+        with self.reading() as connection:
+            return {identity: _by_seq(connection, seq) for identity, seq in _existing(connection, which).items()}
+
+    # --- tokens -------------------------------------------------------------------------------------------
+
+    def add_token(self, name: str, scope: str, digest: str) -> "Future[None]":
+        """Keep a token's hash. Raises `ValueError` where the name is taken."""
+
+        def effect(t: Transaction) -> None:
+            if t.run(sa.select(tokens.c.seq).where(tokens.c.name == name)).first() is not None:
+                raise ValueError(f"token {name!r}: the name is taken, also by a revoked token")
+            t.run(tokens.insert(), [{"name": name, "scope": scope, "hash": digest, "created": time.time()}])
+
+        return self.write(effect)
+
+    def revoke_token(self, name: str) -> "Future[None]":
+        """Let a token count no more. Raises `NotFoundError`."""
+
+        def effect(t: Transaction) -> None:
+            which = (tokens.c.name == name) & tokens.c.revoked.is_(None)
+            if t.run(tokens.update().where(which).values(revoked=time.time())).rowcount == 0:
+                raise NotFoundError(f"token {name!r}: there is none, or it is revoked")
+
+        return self.write(effect)
+
+    def tokens(self) -> list[Token]:
+        """All tokens, the revoked ones too."""
+        with self.reading() as connection:
+            found = connection.execute(sa.select(tokens).order_by(tokens.c.seq))
+            return [Token(row.name, row.scope, row.created, row.revoked) for row in found]
+
+    def token(self, digest: str) -> Token | None:
+        """The token with this hash, unless it is revoked."""
+        query = sa.select(tokens).where(tokens.c.hash == digest, tokens.c.revoked.is_(None))
+        with self.reading() as connection:
+            row = connection.execute(query).first()
+        return None if row is None else Token(row.name, row.scope, row.created, row.revoked)
+
+
+# --- engines ----------------------------------------------------------------------------------------------
+
+
+def _engine(path: Path, writer: bool) -> Engine:
+    """SQLite in WAL mode. The writer's transactions are immediate and flushed to the disk before they count."""
+    engine = sa.create_engine(
+        f"sqlite:///{path}", poolclass=sa.pool.QueuePool, pool_size=1 if writer else 8,
+        max_overflow=0 if writer else 24,
+        connect_args={"check_same_thread": False, "timeout": BUSY}, json_serializer=_compact,
+    )  # fmt: skip
+
+    @sa.event.listens_for(engine, "connect")
+    def _prepare(connection: sqlite3.Connection, _: object) -> None:
+        connection.isolation_level = None  # BEGIN is ours
+        own = ("journal_mode = WAL", "synchronous = FULL") if writer else ("query_only = ON", "wal_autocheckpoint = 0")
+        for pragma in (*own, "foreign_keys = ON", "mmap_size = 0"):
+            connection.execute(f"PRAGMA {pragma}")
+
+    @sa.event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writer else "BEGIN")
+
+    return engine
+
+
+def _compact(tree: Any) -> str:
+    return json.dumps(tree, separators=(",", ":"), allow_nan=False)
+
+
+# --- pieces of transactions -------------------------------------------------------------------------------
+
+
+def _record(row: Row[Any]) -> Job:
+    values = row._mapping
+    return Job(
+        seq=values["seq"], id=values["id"], name=values["name"], identity=values["identity"],
+        state=State(values["state"]), message=values["message"], priority=values["priority"], ranks=values["ranks"],
+        tags=tuple(values["tags"]), time_limit=values["time_limit"], attempt=values["attempt"],
+        failures=values["failures"], retrying=values["retrying"], stopping=values["stopping"],
+        created=values["created"], started=values["started"], ended=values["ended"],
+        core_seconds=values["core_seconds"], result=values["result"], case=values["case"],
+    )  # fmt: skip
+
+
+def _by_seq(connection: Connection, seq: int) -> Job:
+    return _record(connection.execute(sa.select(jobs).where(jobs.c.seq == seq)).one())
+
+
+def _job(connection: Connection, identifier: str) -> Job:
+    row = connection.execute(sa.select(jobs).where(jobs.c.id == identifier)).first()
+    if row is None and len(identifier) >= 4:
+        near = sa.select(jobs).where(jobs.c.id > identifier, jobs.c.id < identifier + "\uffff").limit(2)
+        found = connection.execute(near).all()
+        row = found[0] if len(found) == 1 else None
+    if row is None:
+        raise NotFoundError(f"job {identifier!r}: there is none, or several begin so")
+    return _record(row)
+
+
+def _attempts(connection: Connection, job: Job) -> list[Attempt]:
+    query = sa.select(attempts).where(attempts.c.job == job.seq).order_by(attempts.c.number)
+    return [
+        Attempt(job.id, row.number, tuple(row.cores), row.claimed, row.pid, row.pid_start, row.boot, row.ended,
+                row.state, row.message, row.core_seconds)
+        for row in connection.execute(query)
+    ]  # fmt: skip
+
+
+def _move(t: Transaction, job: Job, move: Move, message: str | None, **values: Any) -> Job:
+    """Change a job's state and tell it as an event."""
+    state = after(job.state, move)
+    changes = {"state": state, "message": message, **values}
+    t.run(jobs.update().where(jobs.c.seq == job.seq).values(changes))
+    t.run(events.insert(), [{"job": job.seq, "at": time.time(), "state": state, "message": message}])
+    return _by_seq(t.connection, job.seq)
+
+
+def _retry(t: Transaction, job: Job) -> Job:
+    """A new life: what broke before does not count."""
+    return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None)
+
+
+def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
+    """Queue jobs. The id is the beginning of the identity, with a number where a case comes again."""
+    now, made = time.time(), list[dict[str, Any]]()
+    base = _existing_ids(t.connection, [job.identity for job in new])
+    for job in new:
+        base[job.identity] = again = base.get(job.identity, 0) + 1
+        made.append(
+            {"id": job.identity[:16] + (f"-{again}" if again > 1 else ""), "name": job.name, "identity": job.identity,
+             "state": State.QUEUED, "priority": job.priority, "ranks": job.ranks, "tags": list(job.tags),
+             "time_limit": job.time_limit, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
+             "created": now, "result": {}, "case": job.case}
+        )  # fmt: skip
+    if not made:
+        return []
+    t.run(jobs.insert(), made)
+    last = t.run(sa.select(sa.func.max(jobs.c.seq))).scalar_one()
+    numbers = range(last - len(made) + 1, last + 1)
+    t.run(events.insert(), [{"job": seq, "at": now, "state": State.QUEUED} for seq in numbers])
+    empty = {"message": None, "started": None, "ended": None, "core_seconds": None}
+    return [
+        Job(**{**row, **empty, "seq": seq, "tags": tuple(row["tags"])})
+        for seq, row in zip(numbers, made, strict=True)
+    ]
+
+
+def _existing_ids(connection: Connection, which: Sequence[str]) -> dict[str, int]:
+    """How many jobs each identity has had."""
+    found: dict[str, int] = {}
+    for k in range(0, len(which), 500):
+        part = sa.select(jobs.c.identity, sa.func.count()).where(jobs.c.identity.in_(which[k : k + 500]))
+        found |= {identity: n for identity, n in connection.execute(part.group_by(jobs.c.identity))}
+    return found
+
+
+def _existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
+    """The seq of the newest job of each identity."""
+    found: dict[str, int] = {}
+    for k in range(0, len(which), 500):
+        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq)).where(jobs.c.identity.in_(which[k : k + 500]))
+        found |= {identity: seq for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
+    return found
+
+
+def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
+    """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done."""
+    numbers = _existing(t.connection, [point.job.identity for point in points])
+    for seq in numbers.values():
+        job = _by_seq(t.connection, seq)
+        if job.final and job.state not in (State.SUCCEEDED, State.FAILED):
+            _retry(t, job)
+    new = _insert(t, [point.job for point in points if point.job.identity not in numbers])
+    return numbers | {job.identity: job.seq for job in new}
+
+
+def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> tuple[int, str]:
+    count = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
+    identifier = f"s{count}"
+    row = {"id": identifier, "name": name, "definition": definition, "duplicates": duplicates, "created": time.time()}
+    return int(t.run(sweeps.insert().values(row)).lastrowid), identifier
+
+
+def _sweep(connection: Connection, identifier: str) -> SweepRecord:
+    """By id first, then by name."""
+    for column in (sweeps.c.id, sweeps.c.name):
+        query = sa.select(sweeps).where(column == identifier).order_by(sweeps.c.seq.desc()).limit(1)
+        if (row := connection.execute(query).first()) is not None:
+            break
+    else:
+        raise NotFoundError(f"sweep {identifier!r}: there is none")
+    grouped = sa.select(jobs.c.state, sa.func.count()).join_from(sweep_jobs, jobs).group_by(jobs.c.state)
+    states = {state: n for state, n in connection.execute(grouped.where(sweep_jobs.c.sweep == row.seq))}
+    return SweepRecord(
+        row.seq, row.id, row.name, row.definition, row.duplicates, row.created, sum(states.values()), states
+    )
+
+
+def _known(t: Transaction, key: Key | None) -> str | None:
+    """What a key made before; `KeyReusedError` where it came with another request."""
+    if key is None:
+        return None
+    query = sa.select(idempotency).where(idempotency.c.key == f"{key.scope} {key.value}")
+    if (row := t.run(query).first()) is None:
+        return None
+    if row.fingerprint != key.fingerprint:
+        raise KeyReusedError(f"Idempotency-Key {key.value!r}: came before, with another request")
+    return str(row.resource)
+
+
+def _remember(t: Transaction, key: Key | None, resource: str) -> None:
+    if key is not None:
+        row = {"key": f"{key.scope} {key.value}", "fingerprint": key.fingerprint, "resource": resource}
+        t.run(idempotency.insert(), [{**row, "created": time.time()}])

@@ -10,7 +10,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -32,12 +32,16 @@ class LaunchError(RuntimeError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """`state` is one of ENDS; `errors` is the last that mpirun and the ranks said outside log.txt."""
+    """`state` is one of ENDS; `errors` is the last that mpirun and the ranks said outside log.txt.
+
+    retry: the machinery broke, not the case; the same run may go better again.
+    """
 
     state: str
     message: str | None
     returncode: int
     errors: str
+    retry: bool = False
 
 
 def solver_arguments() -> list[str]:
@@ -46,7 +50,11 @@ def solver_arguments() -> list[str]:
 
 
 def find_mpirun() -> str:
-    """The one pip put beside this interpreter comes before the system's."""
+    """FRIT_MPIRUN, where it is set; else the one pip put beside this interpreter comes before the system's."""
+    if chosen := os.environ.get("FRIT_MPIRUN"):
+        if shutil.which(chosen) is None:
+            raise LaunchError(f"FRIT_MPIRUN = {chosen}: must be a program that can be run")
+        return chosen
     beside = Path(sys.executable).parent
     path = os.pathsep.join([str(beside), os.environ.get("PATH", os.defpath)])
     if (found := shutil.which("mpirun", path=path)) is None:
@@ -90,12 +98,20 @@ class Launch:
     killed -9 the tree may go on; the solver's own lock then keeps others out of the directory.
     """
 
-    def __init__(self, ranks: int, arguments: Sequence[str], directory: Path) -> None:
+    def __init__(
+        self,
+        ranks: int,
+        arguments: Sequence[str],
+        directory: Path,
+        marks: Mapping[str, str] | None = None,
+        first: Callable[[], None] | None = None,
+    ) -> None:
+        """marks: more for the environment of the tree; first: called in mpirun's process before it is mpirun."""
         command = mpirun_command(ranks, arguments)
         environment = (OPEN_MPI if is_open_mpi(command[0]) else {}) | clean_environment(os.environ)
         # mpich gives each rank a session of its own: only a mark finds those whose mpirun is gone.
-        environment["FRIT_LAUNCH"] = mark = uuid.uuid4().hex
-        self._mark = f"FRIT_LAUNCH={mark}".encode()
+        environment |= {"FRIT_LAUNCH": uuid.uuid4().hex, **(marks or {})}
+        self._mark = f"FRIT_LAUNCH={environment['FRIT_LAUNCH']}"
         self.directory, self.stopping = directory, False
         self._spoken: deque[str] = deque(maxlen=40)
         directory.mkdir(parents=True, exist_ok=True)
@@ -109,6 +125,7 @@ class Launch:
             errors="replace",
             env=environment,
             start_new_session=True,
+            preexec_fn=first,
         )
         self._reaper = threading.Thread(target=self._reap, daemon=True)
         self._reaper.start()
@@ -134,6 +151,11 @@ class Launch:
             elif line.strip():
                 self._spoken.append(line.rstrip())
 
+    @property
+    def alive(self) -> bool:
+        """Whether mpirun still runs."""
+        return self._process.poll() is None
+
     def checkpoint(self) -> None:
         """Ask the ranks for a checkpoint now."""
         self._process.send_signal(signal.SIGUSR1)
@@ -148,15 +170,9 @@ class Launch:
             timer.start()
 
     def kill(self) -> bool:
-        """Kill mpirun and whatever carries the mark (found on Linux); true if any did."""
+        """Kill mpirun and whatever carries the mark; true if any did."""
         self._process.kill()
-        found = False
-        for environ in Path("/proc").glob("[0-9]*/environ"):
-            with suppress(OSError):  # not ours, or gone meanwhile
-                if self._mark in environ.read_bytes():
-                    os.kill(int(environ.parent.name), signal.SIGKILL)
-                    found = True
-        return found
+        return kill_marked(self._mark)
 
     def wait(self) -> Outcome:
         """What run.json says, if it was written since the start, once the whole tree is gone."""
@@ -166,14 +182,15 @@ class Launch:
         record, code, spoken = read_record(self.directory), self._process.returncode, "\n".join(self._spoken)
         fresh = _stamp(self.directory / "run.json") != self._record_before
         if fresh and record.get("state") in ENDS:
-            return Outcome(record["state"], record.get("message"), code, spoken)
+            return Outcome(record["state"], record.get("message"), code, spoken, record.get("retry", False))
         if self.stopping and (self.directory / "checkpoint.h5").exists():
             return Outcome("interrupted", "no new checkpoint was written; the last one stands", code, spoken)
         if self.stopping:
-            return Outcome("failed", "stopped before the first checkpoint was written", code, spoken)
+            return Outcome("failed", "stopped before the first checkpoint was written", code, spoken, retry=True)
         if code == 2:  # another's directory: the solver said so on stderr and left run.json alone
-            return Outcome("refused", None, code, spoken)
-        return Outcome("failed", f"mpirun ended with status {code} and no word of the solver", code, spoken)
+            return Outcome("refused", None, code, spoken, retry=True)
+        message = f"mpirun ended with status {code} and no word of the solver"
+        return Outcome("failed", message, code, spoken, retry=True)
 
     def _reap(self) -> None:
         """mpirun's end is the end of all: no orphan stays."""
@@ -182,6 +199,20 @@ class Launch:
             if not self.kill():
                 break
             time.sleep(0.01)
+
+
+def kill_marked(mark: str) -> bool:
+    """Kill every process with `mark`, NAME=VALUE, in its environment (found on Linux); true if there were any."""
+    found, entry = False, b"\0" + mark.encode() + b"\0"
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with suppress(OSError):  # not ours, or gone meanwhile
+                with open(f"/proc/{name}/environ", "rb", buffering=0) as file:
+                    environment = file.read()
+                if entry in b"\0" + environment:
+                    os.kill(int(name), signal.SIGKILL)
+                    found = True
+    return found
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

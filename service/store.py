@@ -23,7 +23,7 @@ from sqlalchemy.engine import Connection, Engine, Row
 from sqlalchemy.exc import DBAPIError
 
 from . import migrations
-from .jobs import Exit, Job, Move, NewJob, State, after
+from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps, tokens
 
 BATCH = 256  # pieces of work in one transaction, at most
@@ -313,21 +313,20 @@ class Store:
             if job.attempt != end.attempt or not job.state.active:
                 return job
             broke = end.move in (Move.BREAK, Move.LOSE)
-            failures = job.failures + 1 if broke else 0
-            state = after(job.state, end.move)
+            move = end.move
+            if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
+                broke, move = False, Move.STOP
+            state = after(job.state, move)
             which = (attempts.c.job == job.seq) & (attempts.c.number == end.attempt)
             t.run(
                 attempts.update().where(which).values(
                     ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
                 )
             )  # fmt: skip
-            retrying = broke and failures < attempts_limit and not job.stopping
-            if broke and job.stopping:  # nobody wants it any more
-                state, end_move = State.CANCELLED, Move.STOP
-            else:
-                end_move = end.move
+            failures = job.failures + 1 if broke else 0
             return _move(
-                t, job, end_move, end.message, failures=failures, retrying=retrying, stopping=False,
+                t, job, move, end.message, failures=failures, retrying=broke and failures < attempts_limit,
+                stopping=False,
                 ended=None if state is State.QUEUED else end.ended,
                 core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
             )  # fmt: skip
@@ -359,7 +358,7 @@ class Store:
                 t.run(jobs.update().where(jobs.c.seq == job.seq).values(stopping=True))
                 return _by_seq(t.connection, job.seq)
             if job.state in (State.ERROR, State.LOST) and not job.retrying:
-                after(State.SUCCEEDED if job.final else job.state, Move.CANCEL)
+                raise TransitionError(job.state, Move.CANCEL)
             return _move(t, job, Move.CANCEL, None, retrying=False, ended=time.time())
 
         return self.write(effect)

@@ -17,6 +17,6 @@ def _begin(connection):  # type: ignore[no-untyped-def]
 
 
 with engine.connect() as connection:
-    context.configure(connection=connection, transaction_per_migration=False, render_as_batch=True)
+    context.configure(connection=connection, transactional_ddl=True, render_as_batch=True)
     with context.begin_transaction():
         context.run_migrations()

@@ -1,0 +1,97 @@
+"""The engine of the service: one per data folder, with or without HTTP around it."""
+
+import asyncio
+import errno
+import os
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any, Self
+
+from .backends.local import LocalBackend
+from .files import try_lock
+from .hub import Hub
+from .jobs import Job
+from .migrations import IndexVersionError
+from .results import Follower
+from .scheduler import Scheduler
+from .settings import Settings
+from .store import Store
+
+
+class EngineError(RuntimeError):
+    """The data folder cannot be used; the message says why."""
+
+
+class Engine:
+    """Index, scheduler and follower of a data folder, for the length of an `async with`. Runners outlive it."""
+
+    store: Store
+    hub: Hub
+    scheduler: Scheduler
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        """Raises `EngineError`."""
+        async with AsyncExitStack() as stack:
+            stack.callback(os.close, take(self.settings.data))
+            try:
+                self.store = await asyncio.to_thread(Store, self.settings.data)
+            except IndexVersionError as error:
+                raise EngineError(str(error)) from error
+            stack.callback(self.store.close)
+            self.hub = Hub()
+            self.store.listeners.append(self.hub.notify)
+            self._follower = Follower(self.store, self.settings.runs)
+            self.scheduler = Scheduler(self.settings, self.store, self.hub, LocalBackend(), self._follower)
+            stack.push_async_callback(self.scheduler.close)
+            await self.scheduler.adopt()
+            loop = asyncio.create_task(self.scheduler.run())
+            stack.callback(loop.cancel)
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._stack.aclose()
+
+    async def cancel(self, identifier: str) -> Job:
+        """End a job: at once where it has no cores, else its runner is told.
+
+        Raises `TransitionError`, `NotFoundError`.
+        """
+        job = await asyncio.wrap_future(self.store.cancel(identifier))
+        if job.stopping:
+            await self.scheduler.stop(job, "cancelled")
+        return job
+
+    def trouble(self) -> str | None:
+        """Why no job can be started or recorded now; None: all is well."""
+        return self.scheduler.trouble
+
+    def progress(self, identifier: str) -> dict[str, Any] | None:
+        """The last progress line of a running job."""
+        return self._follower.progress(identifier)
+
+    def run_directory(self, identifier: str) -> Path:
+        """Where a job's files are."""
+        return self.settings.runs / identifier
+
+
+def take(data: Path) -> int:
+    """Make the data folder and lock it for this process."""
+    try:
+        (data / "runs").mkdir(parents=True, exist_ok=True)
+        lock = try_lock(data / "lock")
+        if lock is not None:
+            os.ftruncate(lock, 0)
+            os.write(lock, f"{os.getpid()}\n".encode())
+    except OSError as error:
+        reasons = {errno.EROFS: "it is read-only", errno.EACCES: "this user may not write there"}
+        reason = reasons.get(error.errno or 0, error.strerror)
+        raise EngineError(f"data = {data}: cannot be used: {reason}") from error
+    if lock is None:
+        owner = (data / "lock").read_text().strip()
+        raise EngineError(f"data = {data}: in use by process {owner}: one service per data folder")
+    return lock

@@ -1,0 +1,267 @@
+"""The runner: one process per job, which starts mpirun, watches over it and writes down how it ended.
+
+It has a session of its own and outlives the service. From its birth it holds the lock on `runner.lock` in the run
+directory, which it inherits: whoever can take that lock knows that no runner is there, even after a reused pid or a
+crash at any moment. It leaves
+
+    attempt.json   who it is: attempt, pid, start of the process, boot, cores
+    exit.json      how the attempt ended; not there where the runner was killed
+
+and obeys `request.json` when it gets TERM: a reason to stop. Runners are forked from a process that has all of Python
+that they need (`nursery`): a start costs two milliseconds, and the service itself never forks.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+from .files import boot, read_json, start_of, try_lock, write_json
+from .jobs import Exit, Move
+from .launch import Launch, LaunchError, Outcome, kill_marked, read_record
+
+LONGEST = 65_536  # bytes of an order
+PROGRESS_EVERY = 0.5  # seconds between two writes of progress.json
+STUBBORN = 60.0  # seconds for which an exit record that cannot be written (a full disk) is tried again
+PR_SET_PDEATHSIG = 1
+STOPS = {"cancelled": Move.STOP, "timed_out": Move.TIME_OUT, "released": Move.RELEASE}
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What a runner is to do; `directory` holds the case as submitted.json."""
+
+    attempt: int
+    directory: str
+    ranks: int
+    cores: tuple[int, ...]
+    time_limit: float | None
+    grace: float
+
+
+# --- the nursery ------------------------------------------------------------------------------------------
+
+
+def nursery(orders: socket.socket) -> None:
+    """Fork a runner for each order (JSON, and the lock's descriptor), answer with its pid; until the socket ends."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
+    while True:
+        message, handles, _, _ = socket.recv_fds(orders, LONGEST, 1)
+        if not message:
+            return
+        if (pid := os.fork()) == 0:
+            orders.close()
+            born(Order(**json.loads(message)), handles[0])
+        for handle in handles:
+            os.close(handle)
+        with suppress(OSError):  # the service has gone: this was its last order
+            orders.send(str(pid).encode())
+
+
+def born(order: Order, lock: int) -> NoReturn:
+    """The life of a runner; `lock` stays open to its end."""
+    status = 1
+    try:
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        os.setsid()
+        log = os.open(Path(order.directory) / "runner.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        for descriptor in (1, 2):
+            os.dup2(log, descriptor)
+        os.close(log)
+        os.set_inheritable(lock, False)
+        Runner(order).run()
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
+        os._exit(status)
+
+
+# --- one job ----------------------------------------------------------------------------------------------
+
+
+class Runner:
+    """One attempt at one job."""
+
+    def __init__(self, order: Order) -> None:
+        self.order, self.directory = order, Path(order.directory)
+        self.mark = f"FRIT_RUN={self.directory}"
+        self.began = time.monotonic()
+        self.launch: Launch | None = None
+        self.reason: str | None = None  # why to stop, once there is one
+        self.shown = -PROGRESS_EVERY
+        signal.signal(signal.SIGTERM, lambda *_: self.stop(None))
+        signal.signal(signal.SIGUSR1, lambda *_: self.checkpoint())
+
+    def run(self) -> None:
+        """From the record of the start to the record of the end."""
+        order, pid = self.order, os.getpid()
+        record = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
+        write_json(self.directory / "attempt.json", {**record, "cores": order.cores, "started": time.time()})
+        try:
+            move, message = self.attempt()
+        except Exception as error:
+            traceback.print_exc()
+            move, message = Move.BREAK, f"runner: {type(error).__name__}: {error}"
+        seconds = (time.monotonic() - self.began) * order.ranks
+        self.write(Exit(order.attempt, move, message, time.time(), seconds))
+
+    def attempt(self) -> tuple[Move, str | None]:
+        """Run mpirun to its end; what came of it."""
+        if self.order.attempt > 1:
+            self.clear()
+        if self.asked() is not None:
+            self.stop(None)
+        if self.reason is not None:
+            return STOPS[self.reason], "stopped before mpirun was started"
+        if read_record(self.directory).get("state") == "done":  # only the word of the runner before was lost
+            return Move.SUCCEED, None
+        os.sched_setaffinity(0, self.order.cores)
+        try:
+            launch = Launch(self.order.ranks, self.arguments(), self.directory, self.marks(), die_with(os.getpid()))
+        except (LaunchError, OSError) as error:
+            return Move.BREAK, str(error)
+        with launch:
+            self.launch = launch
+            if self.reason is not None:  # it came between the question and the launch
+                self.descend()
+            if self.order.time_limit is not None:
+                timer(self.order.time_limit, lambda: self.stop("timed_out"))
+            for progress in launch:
+                self.show(progress)
+            outcome = launch.wait()
+        return judge(outcome, self.reason)
+
+    def arguments(self) -> list[str]:
+        """Of the solver."""
+        if (self.directory / "checkpoint.h5").exists():
+            return ["--resume", str(self.directory), "--progress"]
+        return [str(self.directory / "submitted.json"), "--out", str(self.directory), "--progress"]
+
+    def marks(self) -> dict[str, str]:
+        """By which a later runner finds what this one may leave behind."""
+        name, value = self.mark.split("=", 1)
+        return {name: value}
+
+    def clear(self) -> None:
+        """End what an earlier attempt left behind, before its solver can get in this one's way."""
+        while kill_marked(self.mark):
+            time.sleep(0.01)
+        deadline = time.monotonic() + 10.0
+        while (lock := try_lock(self.directory / "lock")) is None:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{self.directory}: another process is running here")
+            time.sleep(0.01)
+        os.close(lock)
+
+    def asked(self) -> str | None:
+        """Why this attempt is to stop, if somebody wrote that down."""
+        request = read_json(self.directory / "request.json")
+        return str(request["stop"]) if request.get("attempt") == self.order.attempt else None
+
+    def stop(self, reason: str | None) -> None:
+        """Begin the ladder, once; without a reason, the one that is written down, or: stop for now."""
+        if self.reason is None:
+            self.reason = reason or self.asked() or "released"
+            if self.launch is not None:
+                self.descend()
+
+    def checkpoint(self) -> None:
+        """Pass the wish on, once there are ranks."""
+        if self.launch is not None:
+            self.launch.checkpoint()
+
+    def descend(self) -> None:
+        """USR1, a grace for the checkpoint; TERM, a grace for the end; KILL."""
+        threading.Thread(target=self._descend, daemon=True).start()
+
+    def _descend(self) -> None:
+        assert self.launch is not None  # narrows the type: there is no ladder without a launch
+        path = self.directory / "checkpoint.h5"
+        before = stamp(path)
+        with suppress(ProcessLookupError):
+            self.launch.checkpoint()
+            deadline = time.monotonic() + self.order.grace
+            while stamp(path) == before and time.monotonic() < deadline and self.launch.alive:
+                time.sleep(0.02)
+            self.launch.stop(self.order.grace)
+
+    def show(self, progress: dict[str, Any]) -> None:
+        """Keep the solver's last progress line where the service finds it."""
+        clock = time.monotonic()
+        if clock - self.shown >= PROGRESS_EVERY:
+            self.shown = clock
+            with suppress(OSError):  # a full disk does not end a run that can go on
+                write_json(self.directory / "progress.json", progress, durable=False)
+
+    def write(self, end: Exit) -> None:
+        """The exit record; a full disk may get room again."""
+        deadline = time.monotonic() + STUBBORN
+        while True:
+            try:
+                return write_json(self.directory / "exit.json", asdict(end))
+            except OSError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(1.0)
+
+
+def judge(outcome: Outcome, reason: str | None) -> tuple[Move, str | None]:
+    """What an outcome means for the job, stopped for this reason (None: nobody asked)."""
+    if outcome.state == "done":
+        return Move.SUCCEED, None
+    if reason is not None and (outcome.state == "interrupted" or outcome.retry):
+        return STOPS[reason], outcome.message
+    if outcome.state == "interrupted":
+        return Move.RELEASE, outcome.message
+    message = "\n".join(filter(None, [outcome.message, outcome.errors if outcome.retry else None]))
+    return (Move.BREAK if outcome.retry else Move.FAIL), message or None
+
+
+def read_exit(directory: Path, attempt: int) -> Exit | None:
+    """The exit record of an attempt, if it is there."""
+    record = read_json(directory / "exit.json")
+    return Exit(**{**record, "move": Move(record["move"])}) if record.get("attempt") == attempt else None
+
+
+def stamp(path: Path) -> tuple[int, int] | None:
+    """Differs once a file is replaced."""
+    with suppress(FileNotFoundError):
+        status = path.stat()
+        return status.st_ino, status.st_mtime_ns
+    return None
+
+
+def timer(seconds: float, call: Callable[[], None]) -> None:
+    """Call after that time on a thread that ends with the process."""
+    waiting = threading.Timer(seconds, call)
+    waiting.daemon = True
+    waiting.start()
+
+
+def die_with(parent: int) -> Callable[[], None]:
+    """For the child after the fork: be killed when the parent is."""
+    prctl = ctypes.CDLL(None).prctl
+
+    def tie() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:  # it died before the line above
+            os._exit(1)
+
+    return tie
+
+
+if __name__ == "__main__":
+    nursery(socket.socket(fileno=int(sys.argv[1])))

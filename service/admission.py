@@ -16,7 +16,7 @@ from typing import Any
 from frit.solver.case import Case, CaseError, Problem, parse_case
 
 from .jobs import NewJob, State
-from .problems import HttpProblem, WrongField, escaped, refused, refused_case, shown
+from .problems import HttpError, WrongField, escaped, refused, refused_case, shown
 from .settings import Settings
 from .store import NewPoint, Store
 from .views import FileContent, JobSubmission, SweepSubmission
@@ -28,7 +28,7 @@ Tree = dict[str, Any]
 
 
 def job_of(submission: JobSubmission, settings: Settings) -> NewJob:
-    """The job that a request asks for. Raises `HttpProblem`."""
+    """The job that a request asks for. Raises `HttpError`."""
     check_ranks(submission.ranks, settings, "/ranks")
     tree, uploads = with_uploads(submission.case, submission.files, settings, "/case")
     try:
@@ -71,7 +71,7 @@ class NewSweep:
 
 
 def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
-    """The sweep that a request asks for, with all its points. Takes seconds for many. Raises `HttpProblem`."""
+    """The sweep that a request asks for, with all its points. Takes seconds for many. Raises `HttpError`."""
     from frit.sweeps.definition import parse_sweep
     from frit.sweeps.expand import expand
 
@@ -105,8 +105,8 @@ def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
 def check_ranks(ranks: int, settings: Settings, pointer: str) -> None:
     """A job that needs more cores than there are would wait for ever."""
     if ranks > settings.cores:
-        wrong = WrongField(pointer=pointer, value=ranks, detail=f"must be at most {settings.cores}, the cores there are")
-        raise refused("over-limit", "More than this service allows", [wrong])
+        allowed = f"must be at most {settings.cores}, the cores there are"
+        raise over_limit(WrongField(pointer=pointer, value=ranks, detail=allowed))
 
 
 def estimated_nodes(size: Sequence[float], spacing: float | None) -> float:
@@ -121,10 +121,15 @@ def estimated_nodes(size: Sequence[float], spacing: float | None) -> float:
     return math.prod(counts) * (1 if len(size) == 2 else 2)
 
 
-def too_many_nodes(nodes: float, settings: Settings, pointer: str, spacing: float | None, where: str = "") -> HttpProblem:
+def too_many_nodes(nodes: float, settings: Settings, pointer: str, value: Any, where: str = "") -> HttpError:
     """The problem of a case that is too large."""
     allowed = f"gives about {nodes:.3g} nodes, must be at most {settings.nodes_limit}{where}"
-    return refused("over-limit", "More than this service allows", [WrongField(pointer=pointer, value=spacing, detail=allowed)])
+    return over_limit(WrongField(pointer=pointer, value=value, detail=allowed))
+
+
+def over_limit(wrong: WrongField) -> HttpError:
+    """The problem of a request that wants too much."""
+    return refused("over-limit", "More than this service allows", [wrong])
 
 
 @dataclass
@@ -137,12 +142,12 @@ class QueueLimit:
     counted: float = field(default=-math.inf)
 
     def admit(self, jobs: int) -> None:
-        """Raises `HttpProblem` where the queue is full."""
+        """Raises `HttpError` where the queue is full."""
         if (now := time.monotonic()) > self.counted + QUEUE_COUNT:
             self.queued, self.counted = self.store.count(State.QUEUED), now
         if self.queued + jobs > self.limit:
             detail = f"{self.queued} jobs are queued and {jobs} more came, must be at most {self.limit} together"
-            raise HttpProblem(429, "queue-full", "The queue is full", detail, headers={"Retry-After": "30"})
+            raise HttpError(429, "queue-full", "The queue is full", detail, headers={"Retry-After": "30"})
         self.queued += jobs
 
 
@@ -167,7 +172,7 @@ class Uploads:
 def with_uploads(
     tree: Mapping[str, Any], files: Mapping[str, FileContent], settings: Settings, pointer: str
 ) -> tuple[Tree, Uploads]:
-    """The tree with server paths for the names of files. Raises `HttpProblem` for a path that is not such a name."""
+    """The tree with server paths for the names of files. Raises `HttpError` for a path that is not such a name."""
     if wrong := [
         WrongField(pointer=pointer + place, value=shown(value), detail=_allowed(files))
         for place, value in _paths(tree)

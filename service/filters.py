@@ -1,8 +1,8 @@
 """From query parameters to SQL: which jobs, in which order, from where on.
 
-A filter is `key=value` or `key.operator=value`. Keys are columns of a job, scalars of its case (`particles.mean_radius`)
-or of its result (`result.vacancy_ratio`); keys and types of the case are those of its schema. The SQL of a scalar is
-word for word that of the indices in schema.py, or SQLite would not use them.
+A filter is `key=value` or `key.operator=value`. Keys are columns of a job, scalars of its case such as
+`particles.mean_radius`, or of its result such as `result.vacancy_ratio`; keys and types of the case are those of its
+schema. The SQL of a scalar is word for word that of the indices in schema.py, or SQLite would not use them.
 """
 
 import base64
@@ -26,10 +26,12 @@ from .jobs import Job, State
 from .problems import WrongField, refused
 from .schema import jobs, sweep_jobs
 
+Condition = sa.ColumnElement[bool]
 PAGE = 50  # jobs on a page, unless asked for
 LARGEST_PAGE = 500
 ORDERING = ("lt", "le", "gt", "ge")
 OPERATORS = ("eq", "ne", *ORDERING, "in")
+
 COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
     name: getattr(operator, name) for name in ("eq", "ne", *ORDERING)
 }  # fmt: skip
@@ -52,7 +54,7 @@ class Scalar:
 class Selection:
     """What a list of jobs is made of."""
 
-    where: sa.ColumnElement[bool]
+    where: Condition
     order: tuple[sa.ColumnElement[Any], ...]
     limit: int
     by: str
@@ -130,7 +132,8 @@ def find(key: str, parameter: str) -> Scalar:
         names = [*known(), "sweep", "tag"]
         close = difflib.get_close_matches(key, names, n=1) or [n for n in names if n.rpartition(".")[2] == key][:1]
         hint = f" (did you mean {close[0]}?)" if close else ""
-        raise WrongQueryError(parameter, None, f"unknown key {key!r}; a job's columns, scalars of the case and result.* are known{hint}")
+        allowed = f"unknown key {key!r}: a job's columns, scalars of its case and result.* are known{hint}"
+        raise WrongQueryError(parameter, None, allowed)
     return found
 
 
@@ -138,9 +141,9 @@ def find(key: str, parameter: str) -> Scalar:
 
 
 def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -> Selection:
-    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpProblem`."""
+    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpError`."""
     wrong: list[WrongField] = []
-    where: list[sa.ColumnElement[bool]] = []
+    where: list[Condition] = []
     given: dict[str, list[str]] = {}
     for name, value in parameters:
         given.setdefault(name, []).append(value)
@@ -166,7 +169,7 @@ def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -
     return Selection(sa.and_(sa.true(), *where), (*first, direction(jobs.c.seq)), limit, by, scalar)
 
 
-def _conditions(name: str, values: list[str], sweep: Callable[[str], int]) -> Iterator[sa.ColumnElement[bool]]:
+def _conditions(name: str, values: list[str], sweep: Callable[[str], int]) -> Iterator[Condition]:
     if name == "state":
         states = [state for value in values for state in value.split(",")]
         if unknown := [state for state in states if state not in list(State)]:
@@ -188,7 +191,7 @@ def _conditions(name: str, values: list[str], sweep: Callable[[str], int]) -> It
             yield _condition(scalar, verb, value, name)
 
 
-def _condition(scalar: Scalar, verb: str, text: str, parameter: str) -> sa.ColumnElement[bool]:
+def _condition(scalar: Scalar, verb: str, text: str, parameter: str) -> Condition:
     if verb in ORDERING and scalar.kind in ("string", "boolean"):
         raise WrongQueryError(parameter, text, f"{scalar.key} is a {scalar.kind}: only eq, ne and in are possible")
     if verb == "in":
@@ -245,7 +248,7 @@ def cursor(selection: Selection, last: Job, value: Any) -> str:
     return base64.urlsafe_b64encode(place.encode()).decode().rstrip("=")
 
 
-def _after(text: str, by: str, scalar: Scalar | None) -> sa.ColumnElement[bool]:
+def _after(text: str, by: str, scalar: Scalar | None) -> Condition:
     """Jobs that come after the cursor's. NULL is the smallest value, as SQLite orders it."""
     try:
         place = json.loads(base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True))
@@ -256,13 +259,15 @@ def _after(text: str, by: str, scalar: Scalar | None) -> sa.ColumnElement[bool]:
     if not good:
         raise WrongQueryError("cursor", text, f"must come from the page before, with the same order ({by})")
     descending = by.startswith("-")
-    later = jobs.c.seq < seq if descending else jobs.c.seq > seq
+    later: Condition = jobs.c.seq < seq if descending else jobs.c.seq > seq
     if scalar is None:
         return later
     e = scalar.sql
     if value is None:
-        tied = e.is_(None) & later
+        tied: Condition = e.is_(None) & later
         return tied if descending else tied | e.is_not(None)
-    bound = sa.bindparam(None, float(value) if isinstance(value, int) and abs(value) >= 2**63 else value)
+    wide = isinstance(value, int) and abs(value) >= 2**63
+    bound: sa.BindParameter[Any] = sa.bindparam(None, float(value) if wide else value)
     tied = (e == bound) & later
-    return (e < bound) | e.is_(None) | tied if descending else (e > bound) | tied
+    after: Condition = (e < bound) | e.is_(None) | tied if descending else (e > bound) | tied
+    return after

@@ -60,7 +60,7 @@ class ProblemDetails(BaseModel):
     state: str | None = None
 
 
-class HttpProblem(Exception):
+class HttpError(Exception):
     """An error on its way to the client."""
 
     def __init__(
@@ -81,31 +81,31 @@ class HttpProblem(Exception):
         return Response(json.dumps(tree), self.details.status, self.headers, MEDIA_TYPE)
 
 
-def refused(kind: str, title: str, fields: Sequence[WrongField], status: int = 422) -> HttpProblem:
+def refused(kind: str, title: str, fields: Sequence[WrongField], status: int = 422) -> HttpError:
     """A request with wrong fields."""
     places = (f"{field.parameter or field.pointer or 'body'}: {field.detail}" for field in fields)
-    return HttpProblem(status, kind, title, "; ".join(places), fields)
+    return HttpError(status, kind, title, "; ".join(places), fields)
 
 
-def refused_case(error: CaseError, pointer: str, title: str = "The case is refused") -> HttpProblem:
+def refused_case(error: CaseError, pointer: str, title: str = "The case is refused") -> HttpError:
     """A case or sweep at `pointer` in the body that says what is wrong with it."""
     kind = "refused-case" if pointer == "/case" else "refused-sweep"
     fields = [
         WrongField(pointer=pointer + pointer_to(problem.key), value=shown(problem.value), detail=problem.allowed)
         for problem in error.problems
     ]
-    return HttpProblem(422, kind, title, str(error), fields)
+    return HttpError(422, kind, title, str(error), fields)
 
 
-def unavailable(detail: str) -> HttpProblem:
+def unavailable(detail: str) -> HttpError:
     """The service cannot do it now; trying again later is right."""
     title = "The service cannot do this now"
-    return HttpProblem(503, "unavailable", title, detail, headers={"Retry-After": str(RETRY_AFTER)})
+    return HttpError(503, "unavailable", title, detail, headers={"Retry-After": str(RETRY_AFTER)})
 
 
-def not_found(detail: str) -> HttpProblem:
+def not_found(detail: str) -> HttpError:
     """There is no such thing."""
-    return HttpProblem(404, "not-found", "There is no such thing", detail)
+    return HttpError(404, "not-found", "There is no such thing", detail)
 
 
 def pointer_to(key: str) -> str:
@@ -140,14 +140,14 @@ def handle_problems(app: FastAPI) -> None:
     async def problem(_: Request, error: Exception) -> Response:
         return as_problem(error).response()
 
-    kinds = (HttpProblem, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError)
+    kinds = (HttpError, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError)
     for kind in (*kinds, TransitionError, Exception):
         app.add_exception_handler(kind, problem)
 
 
-def as_problem(error: Exception) -> HttpProblem:
+def as_problem(error: Exception) -> HttpError:
     """What the client is told of an error; nothing of one that was not foreseen."""
-    if isinstance(error, HttpProblem):
+    if isinstance(error, HttpError):
         return error
     if isinstance(error, RequestValidationError):
         return refused("refused-request", "The request is refused", [_wrong(entry) for entry in error.errors()])
@@ -157,15 +157,15 @@ def as_problem(error: Exception) -> HttpProblem:
         return not_found(str(error))
     if isinstance(error, KeyReusedError):
         field = WrongField(parameter="Idempotency-Key", detail=str(error))
-        return HttpProblem(422, "key-reused", "The key came before, with another request", str(error), [field])
+        return HttpError(422, "key-reused", "The key came before, with another request", str(error), [field])
     if isinstance(error, TransitionError):
         title = "The job's state does not allow this"
-        return HttpProblem(409, "wrong-state", title, str(error), state=str(error.state))
+        return HttpError(409, "wrong-state", title, str(error), state=str(error.state))
     if isinstance(error, HTTPException):
         title = http.HTTPStatus(error.status_code).phrase
         kind = title.lower().replace(" ", "-").replace("'", "")
-        return HttpProblem(error.status_code, kind, title, str(error.detail), headers=error.headers)
-    return HttpProblem(500, "internal-error", "The service broke", "an error that was not foreseen; it is in the log")
+        return HttpError(error.status_code, kind, title, str(error.detail), headers=error.headers)
+    return HttpError(500, "internal-error", "The service broke", "an error that was not foreseen; it is in the log")
 
 
 def _wrong(entry: Mapping[str, Any]) -> WrongField:

@@ -14,7 +14,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from .problems import HttpProblem, as_problem
+from .problems import HttpError, as_problem
 from .settings import Settings
 from .store import Store, StoreError
 from .tokens import allows, digest
@@ -58,7 +58,7 @@ class Gate:
         if scope["type"] == "http":
             try:
                 self._check(scope)
-            except (HttpProblem, StoreError) as error:
+            except (HttpError, StoreError) as error:
                 await as_problem(error).response()(scope, receive, send)
                 return
         await self.app(scope, receive, send)
@@ -78,12 +78,12 @@ class Gate:
         chunked = "transfer-encoding" in headers
         if length.isdigit() and int(length) > self.settings.body_limit:
             allowed = f"{length} bytes, must be at most {self.settings.body_limit}"
-            raise HttpProblem(413, "content-too-large", "The body is too large", allowed)
+            raise HttpError(413, "content-too-large", "The body is too large", allowed)
         if kind is None and length == "0" and not chunked:
             return
         if (kind or "").partition(";")[0].strip().lower() != "application/json":
             detail = f"Content-Type = {kind!r}: must be application/json"
-            raise HttpProblem(415, "unsupported-media-type", "The body must be JSON", detail)
+            raise HttpError(415, "unsupported-media-type", "The body must be JSON", detail)
 
 
 def host_name(netloc: str) -> str | None:
@@ -99,7 +99,7 @@ def check_host(headers: Headers, settings: Settings) -> None:
     name = host_name(headers.get("host", ""))
     if name not in LOCAL_NAMES and name != settings.host:
         detail = f"Host = {headers.get('host')!r}: without tokens only localhost, 127.0.0.1 and [::1] are served"
-        raise HttpProblem(421, "misdirected", "The service does not answer to this name", detail)
+        raise HttpError(421, "misdirected", "The service does not answer to this name", detail)
 
 
 def check_origin(headers: Headers) -> None:
@@ -108,7 +108,7 @@ def check_origin(headers: Headers) -> None:
     other = origin is not None and urlsplit(origin).netloc != host
     if other or headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
         detail = f"Origin = {origin!r}: pages of another origin than {host!r} may not send requests"
-        raise HttpProblem(403, "cross-site", "A request from another site", detail)
+        raise HttpError(403, "cross-site", "A request from another site", detail)
 
 
 bearer = HTTPBearer(auto_error=False, description="`frit token create` makes one. Needed as soon as one is active.")
@@ -126,11 +126,11 @@ def needs(scope: str) -> Callable[..., Awaitable[str]]:
         if given is None:
             detail = "a bearer token is needed" if credentials is None else "the token is unknown or revoked"
             challenge = {"WWW-Authenticate": 'Bearer realm="frit"'}
-            raise HttpProblem(401, "unauthorized", "Who are you?", detail, headers=challenge)
+            raise HttpError(401, "unauthorized", "Who are you?", detail, headers=challenge)
         if not allows(given.scope, scope):
             detail = f"token {given.name!r} has scope {given.scope}, this needs {scope}"
-            raise HttpProblem(403, "forbidden", "The token does not allow this", detail)
-        return given.name
+            raise HttpError(403, "forbidden", "The token does not allow this", detail)
+        return str(given.name)
 
     return check
 

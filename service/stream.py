@@ -65,8 +65,9 @@ async def events(engine: Engine, identifier: str, last_event_id: str | None) -> 
 
 
 def _state(change: Any, rows: int, hidden: str) -> ServerSentEvent:
+    at = moment(change.at).isoformat().replace("+00:00", "Z")
     data = {
-        "state": change.state, "sentence": change.state.sentence, "at": moment(change.at).isoformat().replace("+00:00", "Z"),
+        "state": change.state, "sentence": change.state.sentence, "at": at,
         "message": without_path(change.message, hidden),
     }  # fmt: skip
     return ServerSentEvent(event="state", data=data, id=f"{change.seq}-{rows}")

@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from frit.solver.case import Case, CaseError, Problem, parse_case
+from frit.solver.variations import case_text, identity, written
+from frit.sweeps.definition import parse_sweep
+from frit.sweeps.expand import expand
 
 from .jobs import NewJob, State
 from .problems import HttpError, WrongField, escaped, refused, refused_case, shown
@@ -37,10 +40,11 @@ def job_of(submission: JobSubmission, settings: Settings) -> NewJob:
         raise refused_case(uploads.hide(error), "/case") from None
     if (nodes := estimated_nodes(case.domain.size, case.nodes.spacing)) > settings.nodes_limit:
         raise too_many_nodes(nodes, settings, "/case/nodes/spacing", case.nodes.spacing)
+    texts = {name: written(table) for name, table in case.tables().items()}
     return NewJob(
-        case=compact(case), identity=case.identity(), ranks=submission.ranks, priority=submission.priority,
-        name=case.name if submission.name is None else submission.name, tags=tuple(submission.tags),
-        time_limit=submission.time_limit,
+        case=case_text(case.name, texts), identity=identity(texts), ranks=submission.ranks,
+        priority=submission.priority, tags=tuple(submission.tags), time_limit=submission.time_limit,
+        name=case.name if submission.name is None else submission.name,
     )  # fmt: skip
 
 
@@ -50,11 +54,6 @@ def checked(tree: Tree) -> Case:
         return parse_case(tree)
     except RecursionError:
         raise CaseError([Problem("case", None, "is nested too deeply")]) from None
-
-
-def compact(case: Case) -> str:
-    """The resolved case on one line."""
-    return json.dumps(json.loads(case.resolved_json()), separators=(",", ":"))
 
 
 # --- sweeps -----------------------------------------------------------------------------------------------
@@ -72,9 +71,6 @@ class NewSweep:
 
 def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
     """The sweep that a request asks for, with all its points. Takes seconds for many. Raises `HttpError`."""
-    from frit.sweeps.definition import parse_sweep
-    from frit.sweeps.expand import expand
-
     given = submission.model_dump(include={"ranks", "name", "priority", "tags"}, exclude_none=True)
     tree, uploads = with_uploads({**submission.definition, **given}, submission.files, settings, "/definition")
     try:

@@ -39,7 +39,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     app = FastAPI(
         title="frit", version=openapi.version(), description=openapi.DESCRIPTION, lifespan=lifespan,
-        max_body_size=settings.body_limit, generate_unique_id_function=lambda route: route.name,
+        generate_unique_id_function=lambda route: route.name,
     )  # fmt: skip
     handle_problems(app)
     app.include_router(api)

@@ -162,6 +162,8 @@ def as_problem(error: Exception) -> HttpError:
         title = "The job's state does not allow this"
         return HttpError(409, "wrong-state", title, str(error), state=str(error.state))
     if isinstance(error, HTTPException):
+        if error.status_code == 413:
+            return HttpError(413, "content-too-large", "The body is too large", error.detail)
         title = http.HTTPStatus(error.status_code).phrase
         kind = title.lower().replace(" ", "-").replace("'", "")
         return HttpError(error.status_code, kind, title, str(error.detail), headers=error.headers)

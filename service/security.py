@@ -12,7 +12,8 @@ from urllib.parse import urlsplit
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .problems import HttpError, as_problem
 from .settings import Settings
@@ -58,10 +59,25 @@ class Gate:
         if scope["type"] == "http":
             try:
                 self._check(scope)
-            except (HttpError, StoreError) as error:
+            except (HttpError, HTTPException, StoreError) as error:
                 await as_problem(error).response()(scope, receive, send)
                 return
+            receive = self._counted(receive)
         await self.app(scope, receive, send)
+
+    def _counted(self, receive: Receive) -> Receive:
+        """A body without a Content-Length, or with a wrong one, ends where it becomes too large."""
+        came = 0
+
+        async def counted() -> Message:
+            nonlocal came
+            message = await receive()
+            came += len(message.get("body", b""))
+            if came > self.settings.body_limit:
+                raise HTTPException(413, f"more than {self.settings.body_limit} bytes came")  # passes through the route
+            return message
+
+        return counted
 
     def _check(self, scope: Scope) -> None:
         headers = Headers(scope=scope)
@@ -77,8 +93,7 @@ class Gate:
         length, kind = headers.get("content-length", "0"), headers.get("content-type")
         chunked = "transfer-encoding" in headers
         if length.isdigit() and int(length) > self.settings.body_limit:
-            allowed = f"{length} bytes, must be at most {self.settings.body_limit}"
-            raise HttpError(413, "content-too-large", "The body is too large", allowed)
+            raise HTTPException(413, f"{length} bytes, must be at most {self.settings.body_limit}")
         if kind is None and length == "0" and not chunked:
             return
         if (kind or "").partition(";")[0].strip().lower() != "application/json":

@@ -526,7 +526,7 @@ class Store:
             .where(sweep_jobs.c.sweep.in_(which), jobs.c.created >= sweeps.c.created).group_by(sweep_jobs.c.sweep)
         )  # fmt: skip
         with self.reading() as connection:
-            found: dict[int, int] = dict(connection.execute(query).tuples().all())
+            found = {seq: n for seq, n in connection.execute(query)}
         return {seq: found.get(seq, 0) for seq in which}
 
     def curves(self, sweep: int, observable: str) -> dict[int, list[tuple[float, float | None]]]:

@@ -188,6 +188,7 @@ class Store:
                 return
 
     def _commit(self, batch: Sequence[_Work]) -> None:
+        batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
         done: list[tuple[_Work, Any]] = []
         refused: list[tuple[_Work, Exception]] = []
         lines: list[str] = []

@@ -285,7 +285,7 @@ def shown_case(case: Mapping[str, Any]) -> dict[str, Any]:
 
 def without_path(message: str | None, hidden: str) -> str | None:
     """A message that does not tell where on the server it happened."""
-    return message.replace(f"{hidden}/", "") if message else message
+    return message.replace(f"{hidden}/", "").replace(hidden, "data") if message else message
 
 
 def sweep_view(record: SweepRecord, new: int) -> SweepView:

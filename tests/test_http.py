@@ -18,7 +18,9 @@ import zarr
 from fastapi.testclient import TestClient
 from serving import LONG, PACKING, TINY, Tree, final, listening, service, until
 
+from frit.service.admission import estimated_nodes
 from frit.solver.case import parse_case
+from frit.solver.geometry import lattice
 
 SWEEP: Tree = {
     "name": "radius", "base": PACKING, "axes": {"particles.mean_radius": [8.0, 10.0], "particles.seed": [1, 1, 2]}
@@ -277,11 +279,8 @@ def test_limits_are_told_and_kept(tmp_path: Path) -> None:
 
 
 def test_the_estimate_of_nodes_is_that_of_the_lattice() -> None:
-    from frit.service.admission import estimated_nodes
-    from frit.solver.geometry import lattice_mesh
-
     for size, spacing in [((40.0, 30.0), 1.0), ((22.0, 13.0), 0.5), ((12.0, 14.0, 16.0), 1.0)]:
-        nodes = len(lattice_mesh(size, spacing).nodes)
+        nodes = len(lattice(size, spacing).nodes)
         assert estimated_nodes(size, spacing) == pytest.approx(nodes, rel=0.15)
     assert estimated_nodes((1e300, 1e300), 1e-300) == float("inf")
 

@@ -10,7 +10,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import timedelta
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import monotonic
@@ -20,7 +19,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from . import commands_sweep
 from .launch import Launch, LaunchError, Outcome, read_record
+from .words import cell, in_words, refuse
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
@@ -32,6 +33,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(commands_sweep.app, name="sweep")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -50,13 +52,6 @@ RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_o
 def main() -> None:
     """Entry point of the console script."""
     app()
-
-
-def refuse(*lines: str) -> NoReturn:
-    """Say on stderr what is wrong with the input, and leave with 2."""
-    for line in lines:
-        typer.echo(line, err=True)
-    raise typer.Exit(2)
 
 
 def show_version(wanted: bool) -> None:
@@ -211,22 +206,6 @@ def progress_bar() -> Iterator[tuple[Progress, TaskID]]:
         yield bar, bar.add_task("starting", total=None)
 
 
-def in_words(progress: dict[str, Any]) -> str:
-    """A progress line; what rank 0 does not know yet is a dash."""
-
-    def word(key: str, form: str) -> str:
-        value = progress.get(key)
-        return "-" if value is None else format(value, form)
-
-    seconds = progress.get("remaining")
-    left = "-" if seconds is None else timedelta(seconds=round(seconds))
-    return (
-        f"t {word('time', '.4g')}/{word('end', '.4g')} step {word('step', 'd')}"
-        f" {word('evaluations_per_second', '.3g')} ev/s live {word('live_fraction', '.0%')}"
-        f" vacancy {word('vacancy_ratio', '.4f')} {left} left"
-    )
-
-
 def report(
     directory: Path, outcome: Outcome, progress: dict[str, Any], wall_time: float | None, as_json: bool
 ) -> None:
@@ -244,11 +223,6 @@ def report(
         typer.echo("\n".join(filter(None, lines)), err=True)
     elif outcome.state == "interrupted":
         typer.echo(f"interrupted ({outcome.message}); `frit resume {directory}` goes on", err=True)
-
-
-def cell(value: object) -> str:
-    """Of the summary's table."""
-    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def summarise(

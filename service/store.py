@@ -146,18 +146,22 @@ class _Work:
 class Store:
     """The index of one data folder. Methods that change it give a future, done once the change is durable."""
 
-    def __init__(self, folder: Path) -> None:
-        """Open an up-to-date index; make it where there is none. Raises `StoreError`."""
+    def __init__(self, folder: Path, writable: bool = True) -> None:
+        """Open an up-to-date index; make it where there is none. Raises `IndexVersionError`.
+
+        writable: False for a look beside the service that writes; there can be one writer only.
+        """
         self.path = folder.absolute() / "frit.db"
         self.journal = folder.absolute() / "submitted.jsonl"
         migrations.prepare(self.path)
         self._writer = _engine(self.path, writer=True)
         self._reader = _engine(self.path, writer=False)
         self._waiting: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
-        self._closed = False
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
-        self._thread.start()
+        self._closed = not writable
+        if writable:
+            self._thread.start()
 
     def close(self) -> None:
         """Finish what waits, and close."""
@@ -165,15 +169,15 @@ class Store:
             self._closed = True
             self._waiting.put(None)
             self._thread.join()
-            self._writer.dispose()
-            self._reader.dispose()
+        self._writer.dispose()
+        self._reader.dispose()
 
     # --- the writer ---------------------------------------------------------------------------------------
 
     def write(self, effect: "Callable[[Transaction], T]") -> "Future[T]":
         """Have the effect done in a transaction; the future is done when it is durable."""
         if self._closed:
-            raise StoreError("the index is closed")
+            raise StoreError(f"{self.path}: closed, or opened for reading only")
         work = _Work(effect, Future())
         self._waiting.put(work)
         return work.answer
@@ -561,6 +565,13 @@ class Store:
         """The id of what a key made before. Raises `KeyReusedError`."""
         with self.reading() as connection:
             return _known(Transaction(connection), key)
+
+    def measured(self, limit: int = 1000) -> list[tuple[str, float]]:
+        """The case and the core-seconds of the last jobs that succeeded at the first attempt."""
+        fits = (jobs.c.state == State.SUCCEEDED) & (jobs.c.attempt == 1) & jobs.c.core_seconds.is_not(None)
+        query = sa.select(jobs.c.case, jobs.c.core_seconds).where(fits).order_by(jobs.c.seq.desc()).limit(limit)
+        with self.reading() as connection:
+            return [(row.case, row.core_seconds) for row in connection.execute(query)]
 
     # --- tokens -------------------------------------------------------------------------------------------
 

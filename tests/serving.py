@@ -1,143 +1,123 @@
-"""The real service for tests: in this process for quick questions, as a process of its own to be killed."""
+"""Engines in tests: with the real solver on tiny cases, and with a stand-in where only the machinery matters."""
 
-import os
-import signal
-import socket
-import subprocess
+import asyncio
+import json
+import stat
 import sys
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import httpx2
-import uvicorn
-from fastapi.testclient import TestClient
-
-from frit.service.app import create_app
+from frit.service.engine import Engine
+from frit.service.jobs import Job, NewJob, State
 from frit.service.settings import Settings
+from frit.solver.case import parse_case
 
-Tree = dict[str, Any]
+TIMEOUT = 120.0  # seconds; for hangs alone
 
-TIMEOUT = 120.0  # seconds; there for hangs
+# In the place of mpirun. The name of the case says what to do.
+STAND_IN = f"""#!{sys.executable} -S
+import json, os, signal, sys, time
+if "--version" in sys.argv:
+    print("HYDRA build details")
+    sys.exit()
+resumed = "--resume" in sys.argv
+directory = sys.argv[sys.argv.index("--resume" if resumed else "--out") + 1]
+with open(os.path.join(directory, "submitted.json")) as file:
+    what, *rest = json.load(file)["name"].split()
+with open(os.path.join(directory, "calls"), "a") as file:
+    file.write(f"{{os.getpid()}} {{sorted(os.sched_getaffinity(0))}} {{time.monotonic()}}\\n")
 
-# Solved in a moment once the kernels are compiled: 10 steps of two touching discs.
-TINY: Tree = {
-    "name": "tiny",
+def record(state, message=None, retry=False):
+    with open(os.path.join(directory, "run.new"), "w") as file:
+        json.dump({{"state": state, "message": message, "retry": retry}}, file)
+    os.replace(os.path.join(directory, "run.new"), os.path.join(directory, "run.json"))
+
+def checkpoint(*_):
+    with open(os.path.join(directory, "checkpoint.h5"), "w") as file:
+        file.write(str(time.monotonic()))
+
+def end(*_):
+    checkpoint()
+    record("interrupted", "checkpoint at t = 1")
+    os._exit(0)
+
+signal.signal(signal.SIGUSR1, checkpoint)
+signal.signal(signal.SIGTERM, end)
+if what == "deaf":
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+if what == "crash":
+    os.kill(os.getpid(), signal.SIGSEGV)
+if what == "says-no":
+    record("failed", "fields left [-0.5, 1.5]")
+    sys.exit(1)
+if what == "disk":
+    record("failed", "OSError: no space", True)
+    sys.exit(1)
+if what == "once" and not resumed and not os.path.exists(os.path.join(directory, "checkpoint.h5")):
+    checkpoint()
+    os.kill(os.getpid(), signal.SIGKILL)
+if what in ("sleep", "deaf"):
+    stop = time.monotonic() + float(rest[0])
+    while time.monotonic() < stop:
+        time.sleep(0.005)
+record("done")
+"""
+
+PAIR: dict[str, Any] = {
     "domain": {"size": [22.0, 13.0]},
     "nodes": {"spacing": 1.0},
     "particles": {"centres": [[6.5, 6.2], [15.4, 6.8]], "radii": [5.0, 4.0]},
-    "time": {"integrator": "rk2", "end": 0.001, "step": 1e-4},
-    "output": {"history_every": 0.0002, "snapshots": [0.0, 0.001]},
+    "time": {"integrator": "rk2", "end": 0.01, "step": 1e-4},
+    "output": {"history_every": 0.001, "snapshots": [0.0, 0.01]},
 }
-# Never solved: it is cancelled long before.
-LONG: Tree = {**TINY, "name": "long", "time": {"integrator": "rk2", "end": 10.0, "step": 1e-4}}
-PACKING: Tree = {
-    "name": "pack",
-    "domain": {"size": [100.0, 60.0]},
-    "nodes": {"spacing": 1.0},
-    "particles": {
-        "source": "packing", "mean_radius": 8.0, "packing_density": 0.4, "container": [[5.0, 5.0], [95.0, 55.0]]
-    },
-    "time": {"end": 1.0},
-}  # fmt: skip
-
-SERVER = """
-import sys, uvicorn
-from pathlib import Path
-from frit.service.app import create_app
-from frit.service.settings import Settings
-settings = Settings(data=Path(sys.argv[1]), cores=1, free_disk=0, poll=0.05)
-uvicorn.run(create_app(settings), port=int(sys.argv[2]), log_level="warning", timeout_graceful_shutdown=1)
-"""
 
 
-def settings_in(folder: Path, **more: Any) -> Settings:
-    """Of a service that runs nothing by itself: the disk is never free enough. `free_disk=0` lets it."""
-    return Settings(**{"data": folder, "cores": 2, "free_disk": 1 << 62, "poll": 0.05, **more})
+def stand_in(folder: Path) -> str:
+    """A program for FRIT_MPIRUN."""
+    program = folder / "stand-in"
+    program.write_text(STAND_IN)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return str(program)
 
 
-@contextmanager
-def service(folder: Path, **more: Any) -> Iterator[TestClient]:
-    """The app in this process, asked without a socket."""
-    app = create_app(settings_in(folder, **more))
-    with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as client:
-        yield client
+def new_job(name: str, shift: float = 0.0, steps: int = 100, **asked: Any) -> NewJob:
+    """A pair of discs whose case is told from others' by the shift."""
+    tree = json.loads(json.dumps(PAIR))
+    tree["name"] = name
+    tree["particles"]["centres"][1][0] += shift
+    tree["time"]["end"] = steps * 1e-4
+    tree["output"] = {"history_every": steps * 1e-5, "snapshots": [0.0, steps * 1e-4], "checkpoint_every": 0.2}
+    case = parse_case(tree)
+    return NewJob(json.dumps(json.loads(case.resolved_json())), case.identity(), name, **asked)
 
 
-@contextmanager
-def listening(folder: Path, **more: Any) -> Iterator[str]:
-    """The app in a thread behind a real socket; gives its URL."""
-    config = uvicorn.Config(
-        create_app(settings_in(folder, **more)), port=0, log_level="error", timeout_graceful_shutdown=1
-    )
-    server = uvicorn.Server(config)
-    listener = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    try:
-        until(lambda: server.started or not thread.is_alive())
-        assert thread.is_alive(), "the server did not start"
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join(TIMEOUT)
-        listener.close()
+def settings(data: Path, **changes: Any) -> Settings:
+    """Quick to try again, and to look."""
+    quick = {"cores": 2, "backoff": 0.05, "backoff_limit": 0.1, "poll": 0.1, "grace": 20.0, "free_disk": 0}
+    return Settings(data=data, **{**quick, **changes})
 
 
-class Process:
-    """The service as a process of its own, on one port through all its lives."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.port = folder, free_port()
-        self.url = f"http://127.0.0.1:{self.port}"
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        """Until it is ready."""
-        command = [sys.executable, "-P", "-c", SERVER, str(self.folder), str(self.port)]
-        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-        until(self._ready)
-
-    def _ready(self) -> bool:
-        assert self.process is not None  # started
-        assert self.process.poll() is None, "the server has ended"
-        try:
-            return httpx2.get(f"{self.url}/readyz").status_code == 200
-        except httpx2.TransportError:
-            return False
-
-    def end(self, number: signal.Signals = signal.SIGTERM) -> None:
-        """By a signal; to the end."""
-        if self.process is not None:
-            os.kill(self.process.pid, number)
-            self.process.wait(TIMEOUT)
-            self.process = None
+async def submit(engine: Engine, *jobs: NewJob) -> list[Job]:
+    """Queue them, in order."""
+    return [await asyncio.wrap_future(engine.store.submit(job)) for job in jobs]
 
 
-def free_port() -> int:
-    """One that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return int(listener.getsockname()[1])
+async def until(engine: Engine, condition: Callable[[], bool]) -> None:
+    """Wait for a condition on the index; TimeoutError is a hang."""
+    async with asyncio.timeout(TIMEOUT):
+        while not condition():
+            await engine.hub.wait(0.1)
 
 
-def until(happened: Any) -> None:
-    """Wait; the limit is there for hangs."""
-    deadline = time.monotonic() + TIMEOUT
-    while not happened():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+async def ended(engine: Engine, *jobs: Job) -> list[Job]:
+    """The jobs, once they are all final."""
+    await until(engine, lambda: all(engine.store.job(job.id).final for job in jobs))
+    return [engine.store.job(job.id) for job in jobs]
 
 
-def final(client: TestClient, identifier: str) -> Tree:
-    """The job once it is final."""
-    found: Tree = {}
-
-    def done() -> bool:
-        found.update(client.get(f"/v1/jobs/{identifier}").json())
-        return bool(found["final"])
-
-    until(done)
-    return found
+async def in_state(engine: Engine, job: Job, state: State) -> Job:
+    """The job, once it is in the state."""
+    await until(engine, lambda: engine.store.job(job.id).state is state)
+    return engine.store.job(job.id)

@@ -15,8 +15,8 @@ import httpx2
 import pytest
 import xarray as xr
 import zarr
+from asking import LONG, PACKING, TINY, Tree, final, listening, service, until
 from fastapi.testclient import TestClient
-from serving import LONG, PACKING, TINY, Tree, final, listening, service, until
 
 from frit.service.admission import estimated_nodes
 from frit.solver.case import parse_case

@@ -60,12 +60,12 @@ class Engine:
     async def __aexit__(self, *_: object) -> None:
         await self._stack.aclose()
 
-    async def cancel(self, identifier: str) -> Job:
-        """End a job: at once where it has no cores, else its runner is told.
+    async def cancel(self, identifier: str, key: Key | None = None) -> Job:
+        """End a job: at once where it has no cores, else its runner is told. A key that came before changes nothing.
 
-        Raises `TransitionError`, `NotFoundError`.
+        Raises `TransitionError`, `NotFoundError`, `KeyReusedError`.
         """
-        job = await asyncio.wrap_future(self.store.cancel(identifier))
+        job = await asyncio.wrap_future(self.store.cancel(identifier, key))
         if job.stopping:
             await self.scheduler.stop(job, "cancelled")
         return job

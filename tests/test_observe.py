@@ -96,7 +96,7 @@ def test_a_particle_in_the_box_is_measured_whole(dim: int, ranks: Ranks) -> None
 @pytest.mark.parametrize("kind", ["lme", "linear"])
 def test_a_pack_is_measured_to_a_ten_thousandth(kind: str, ranks: Ranks) -> None:
     """What the model asks for, where it matters: a box whose faces cut many particles, in and out alike."""
-    case = parse_case(load_case(PACK)._tree() | {"shape_functions": {"kind": kind}})
+    case = parse_case(load_case(PACK).tree() | {"shape_functions": {"kind": kind}})
     mesh = build_mesh(case, ranks)
     d = discretise(case, mesh, ranks, np.ones(len(mesh.points)))
     discs = list(zip(case.particles.centres, case.particles.radii, strict=True))

@@ -19,9 +19,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from . import commands_sweep
+from . import commands_server, commands_sweep, commands_token
 from .launch import Launch, LaunchError, Outcome, read_record
-from .words import cell, in_words, refuse
+from .words import AsJson, cell, in_words, refuse
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
@@ -34,6 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(commands_sweep.app, name="sweep")
+app.add_typer(commands_token.app, name="token")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -45,7 +46,6 @@ def at_least_one(ranks: int | None) -> int | None:
 
 CaseFile = Annotated[Path, typer.Argument(metavar="CASE.toml", exists=True, dir_okay=False, help="Or JSON.")]
 Ranks = Annotated[int, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False)]
 
 
@@ -136,6 +136,9 @@ def plot(
             typer.echo(f"{out}: snapshot at t = {time:g}")
     except (ValueError, OSError) as error:
         refuse(str(error))
+
+
+commands_server.add_to(app)
 
 
 @app.command()

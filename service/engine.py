@@ -14,6 +14,7 @@ from .jobs import Job, NewJob
 from .migrations import IndexVersionError
 from .results import Follower
 from .scheduler import Scheduler
+from .security import check_address
 from .settings import Settings
 from .store import Key, NewPoint, Store, SweepRecord
 
@@ -90,6 +91,21 @@ class Engine:
     def run_directory(self, identifier: str) -> Path:
         """Where a job's files are."""
         return self.settings.runs / identifier
+
+
+def check(settings: Settings) -> None:
+    """Say early why a service cannot be started. Raises `EngineError`, `AddressError`."""
+    lock = take(settings.data)
+    try:
+        store = Store(settings.data)
+        try:
+            check_address(settings, store)
+        finally:
+            store.close()
+    except IndexVersionError as error:
+        raise EngineError(str(error)) from error
+    finally:
+        os.close(lock)
 
 
 def take(data: Path) -> int:

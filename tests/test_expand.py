@@ -18,7 +18,7 @@ from frit.sweeps.expand import MOST_REFUSED, Expansion, count, expand
 
 Tree = dict[str, Any]
 
-PACKING = {
+PACKING: Tree = {
     "domain": {"size": [100, 100]},
     "nodes": {"spacing": 1},
     "particles": {"source": "packing", "mean_radius": 8.0, "packing_density": 0.4, "container": [[5, 5], [95, 95]]},

@@ -3,9 +3,9 @@
 The model counts work: every evaluation of the rates visits each live material point and its nodes. It was fitted by
 hand to ten runs on one shared 2.6 GHz core, in processor seconds, with kernels compiled before: two discs (both
 integrators, with and without rigid motion, gamma 1.8 and 4, spacing 1 and 0.5), two spheres, and packs of 11, 18 and
-22 discs of radius 6. It meets their evaluations and seconds within a factor of 1.6. Elsewhere expect a factor of 3: a
-poured pack of 30 discs took 0.4 of the evaluations and 0.8 of the seconds. With hundreds of particles, or tolerances far
-from 1e-3, nothing was measured. Compiling and packing are left out.
+22 discs of radius 6. It meets their evaluations and seconds within a factor of 1.6. Elsewhere expect a factor of 3:
+a poured pack of 30 discs took 0.4 of the evaluations and 0.8 of the seconds. With hundreds of particles, or tolerances
+far from 1e-3, nothing was measured. Compiling and packing are left out.
 """
 
 import json

@@ -40,6 +40,7 @@ from scipy.spatial import cKDTree
 from .arrays import Flags, Floats
 
 CANONICAL = json.JSONEncoder(sort_keys=True)
+PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
 # --- vocabulary
@@ -492,7 +493,9 @@ def fingerprint(tables: Mapping[str, str]) -> str:
 # --- across tables
 
 
-def filled_in(output: Mapping[str, Any], end: float, domain: Domain | None, particles: Particles | None) -> dict[str, Any]:
+def filled_in(
+    output: Mapping[str, Any], end: float, domain: Domain | None, particles: Particles | None
+) -> dict[str, Any]:
     """The plain table with the defaults that need other tables."""
     given = {key: value for key, value in output.items() if value is not None}
     if "vacancy_box" not in given:
@@ -655,8 +658,7 @@ def problems(error: ValidationError, table_at: Callable[[Place], type[BaseModel]
             about = _about(table_at(loc), loc[-1]) if isinstance(loc[-1], str) else ""
             yield Problem(_dotted(loc), None, f"must be given{about}")
         else:
-            plain = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}.get(kind)
-            allowed = plain or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
+            allowed = PLAIN.get(kind) or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
             if kind == "extra_forbidden":
                 allowed = _known(str(loc[-1]), table_at(loc))
             yield Problem(_dotted(loc), entry["input"], allowed)

@@ -246,7 +246,7 @@ def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
 
 
 def record_end(directory: Path, state: str, message: str | None, retry: bool = False) -> None:
-    """How it ended, into run.json; the message into log.txt too. retry: not the case's fault, it may go better again."""
+    """How it ended, into run.json; the message into log.txt too. retry: the machinery broke, not the case."""
     path = directory / "run.json"
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     record |= {"state": state, "message": message, "retry": retry, "end": output.now()}

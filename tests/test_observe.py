@@ -124,10 +124,6 @@ def cut_error(dim: int, kind: str, spacing: float, ranks: Ranks) -> float:
 
 @pytest.mark.parametrize("kind", ["lme", "linear"])
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.xfail(
-    strict=True,
-    reason="one value per cell of a field that N_a smooths: 0.12 h^2 (lme), 0.06 h^2 (linear) of grad rho on the faces",
-)
 def test_a_particle_that_the_box_cuts_is_measured_to_a_ten_thousandth(dim: int, kind: str, ranks: Ranks) -> None:
     assert cut_error(dim, kind, 1.0, ranks) < 1e-4
 

@@ -42,7 +42,7 @@ class Monomials(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Nodes sorted into cubes of edge `width`: starts[bin] : starts[bin + 1] are the places of a bin's in x and number."""
+    """Nodes sorted into cubes of edge `width`: a bin's are at starts[bin] ... starts[bin + 1] of x and number."""
 
     x: Floats  # (n, dim)
     number: Integers  # (n,) in the mesh
@@ -61,7 +61,8 @@ def box_weights(mesh: Mesh, low: Floats, high: Floats, regular: bool, ranks: Ran
     spacing = np.zeros(len(mesh.nodes))
     volumes = np.zeros(len(mesh.nodes))
     gather(spacing, volumes, mesh.cells, mesh.spacing, mesh.weights)
-    # In reaches: fits are like all others from `first` inside the box, weights one further, nodes that change others two.
+    # In reaches: fits are all alike from `first` inside the box on; one reach further in, so are weights; two reaches
+    # further in are nodes whose fits change no other weights.
     reach = REACH * float(spacing.max())
     depth = np.minimum(mesh.nodes - low, high - mesh.nodes).min(axis=1) / reach
     walls = np.minimum(low - mesh.nodes.min(axis=0), mesh.nodes.max(axis=0) - high).min() / reach
@@ -75,8 +76,8 @@ def box_weights(mesh: Mesh, low: Floats, high: Floats, regular: bool, ranks: Ran
 
 def share_of(nodes: Flags, ranks: Ranks) -> Flags:
     """The interval of node numbers (as flags) that is this rank's: equal numbers of the given nodes to each."""
-    place = np.cumsum(nodes) * ranks.size // max(1, np.count_nonzero(nodes))
-    return np.asarray(np.minimum(place, ranks.size - 1) == ranks.rank)
+    place = np.cumsum(nodes) * ranks.size // (1 + int(np.count_nonzero(nodes)))
+    return np.asarray(place == ranks.rank)
 
 
 def add_fits(weights: Floats, mesh: Mesh, low: Floats, high: Floats, spacing: Floats, wanted: Flags) -> None:
@@ -96,7 +97,7 @@ def add_fits(weights: Floats, mesh: Mesh, low: Floats, high: Floats, spacing: Fl
 
 
 def monomials(dim: int, degree: int) -> Monomials:
-    """All of them up to a degree: those of degree k are those of degree k - 1 times a coordinate not before their last."""
+    """All of them up to a degree: each times the coordinates from its last one on gives those one degree higher."""
     parent, axis, ends = [0], [0], [1]
     for k in range(degree):
         for m in range(ends[k - 1] if k else 0, ends[k]):
@@ -143,7 +144,7 @@ def add_moments(
     moments: Floats, corners: Floats, volumes: Floats, cells: Numbers, nodes: Floats, wanted: Flags,
     rule: Floats, rule_weights: Floats, basis: Monomials,
 ) -> None:
-    """M_a: add the moments of simplices (s, dim + 1, dim), parts of cells (s, dim + 1), at the cells' wanted corners."""
+    """M_a: add the moments of simplices (s, dim + 1, dim), parts of cells (s, dim + 1), at their wanted corners."""
     points, dim = len(rule_weights), nodes.shape[1]
     x, y, P = np.empty((dim, points)), np.empty((dim, points)), np.empty((moments.shape[1], points))
     for s in range(len(volumes)):
@@ -197,7 +198,7 @@ def fit(
                 for i in range(dim):
                     y[i, b] = (bins.x[near[b], i] - nodes[a, i]) / spacing[a]
                     r2 += y[i, b] ** 2
-                r = min(1.0, np.sqrt(r2) / reach)
+                r = np.sqrt(r2) / reach
                 W[b] = (1.0 - r) ** 4 * (4.0 * r + 1.0)
             terms = basis.ends[degree]
             evaluate(P, y, count, basis)
@@ -238,8 +239,8 @@ def find(near: Integers, x: Floats, reach: float, bins: Bins) -> int:
     dim, last, count = len(x), len(x) - 1, 0
     lower, upper = np.zeros(3, np.int64), np.zeros(3, np.int64)
     for i in range(dim):
-        lower[i] = max(0, np.int64((x[i] - reach - bins.origin[i]) / bins.width))
-        upper[i] = min(bins.shape[i] - 1, np.int64((x[i] + reach - bins.origin[i]) / bins.width))
+        lower[i] = max(0, int((x[i] - reach - bins.origin[i]) / bins.width))
+        upper[i] = min(int(bins.shape[i]) - 1, int((x[i] + reach - bins.origin[i]) / bins.width))
     for i in range(lower[0], upper[0] + 1):
         for j in range(lower[1], upper[1] + 1) if dim == 3 else range(1):
             row = ((i * bins.shape[1] + j) if dim == 3 else i) * bins.shape[last]

@@ -151,12 +151,12 @@ def section(target: Floats, m: int, row: int, x: Floats, distance: Floats, a: in
 @jit
 def volume(x: Floats) -> float:
     """|det(x_1 - x_0, ..., x_dim - x_0)| / dim!"""
-    dim = x.shape[1]
+    dim, determinant = x.shape[1], 0.0
     if dim == 2:
-        return abs((x[1, 0] - x[0, 0]) * (x[2, 1] - x[0, 1]) - (x[1, 1] - x[0, 1]) * (x[2, 0] - x[0, 0])) / 2.0
-    six = 0.0
+        determinant += (x[1, 0] - x[0, 0]) * (x[2, 1] - x[0, 1]) - (x[1, 1] - x[0, 1]) * (x[2, 0] - x[0, 0])
+        return float(abs(determinant)) / 2.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         minor = (x[2, j] - x[0, j]) * (x[3, k] - x[0, k]) - (x[2, k] - x[0, k]) * (x[3, j] - x[0, j])
-        six += (x[1, i] - x[0, i]) * minor
-    return abs(six) / 6.0
+        determinant += (x[1, i] - x[0, i]) * minor
+    return float(abs(determinant)) / 6.0

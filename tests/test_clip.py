@@ -30,8 +30,8 @@ def measured(nodes: Floats, cells: Numbers, lower: Floats, upper: Floats) -> tup
     edges = corners[:, 1:] - corners[:, :1]
     exact = np.abs(np.linalg.det(edges)) / (2.0 if nodes.shape[1] == 2 else 6.0)
     np.testing.assert_allclose(parts, exact, rtol=1e-9, atol=1e-15)
-    volumes = np.bincount(owner, parts, len(cells))
-    centroids = nodes[cells].mean(axis=1)
+    volumes: Floats = np.asarray(np.bincount(owner, parts, len(cells)), dtype=np.float64)
+    centroids: Floats = np.asarray(nodes[cells].mean(axis=1))
     shares = (parts / volumes[owner])[:, None] * (corners.mean(axis=1) - centroids[owner])
     np.add.at(centroids, owner, shares)
     return volumes, centroids

@@ -178,7 +178,10 @@ def compare(
 
     if out is not None and out.suffix not in (*CURVES, ".html", ".csv"):
         refuse(f"--out {out}: must end in {', '.join(CURVES)}, .html or .csv")
-    found = compared_here(data, sweep, observable) if data is not None else compared_there(url, token, sweep, observable)
+    if data is not None:
+        found = compared_here(data, sweep, observable)
+    else:
+        found = compared_there(url, token, sweep, observable)
     lines = [
         curves.Curve(c["name"], c["parameters"], c["time"], c["values"]) for c in found["curves"] if c["time"]
     ]  # fmt: skip

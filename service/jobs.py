@@ -94,7 +94,7 @@ class TransitionError(ValueError):
     def __init__(self, state: State, move: Move) -> None:
         self.state, self.move = state, move
         allowed = ", ".join(before for before, m in TRANSITIONS if m == move)
-        super().__init__(f"state = {state!r}: {move} is possible only from {allowed}")
+        super().__init__(f"state = {str(state)!r}: {move} is possible only from {allowed}")
 
 
 def after(state: State, move: Move) -> State:

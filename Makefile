@@ -9,7 +9,7 @@ RANKS ?= 2
 CASE ?= sweeps/cases/pack.toml
 OUT ?= runs/$(basename $(notdir $(CASE)))
 SWEEP ?= sweeps/quick.toml
-DATA ?= data
+DATA ?= runs/data
 
 # Installed as a strict editable package: a new or removed file asks for a new install, an edited one does not.
 FILES := $(sort $(shell find solver service sweeps -name '*.py'))
@@ -59,4 +59,4 @@ $(LISTED): pyproject.toml | $(BIN)/python
 	touch $@
 
 clean:
-	rm -rf runs data
+	rm -rf runs

@@ -27,6 +27,7 @@ from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
+FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
 T = TypeVar("T")
 
@@ -446,14 +447,20 @@ class Store:
             return [_record(row) for row in connection.execute(query if where is None else query.where(where))]
 
     def page(
-        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int, value: sa.ColumnElement[Any] | None
-    ) -> list[tuple[Job, Any]]:
+        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int,
+        value: sa.ColumnElement[Any] | None = None, indexed: bool = False,
+    ) -> list[tuple[Job, Any]]:  # fmt: skip
         """Jobs that fit, in order, each with the value it is ordered by.
 
-        The jobs are chosen first and read afterwards: sorting moves numbers, not cases.
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `indexed`: an index has what
+        the filter needs, but not in this order; so where few jobs fit they are found by it and sorted, and where many
+        do, a walk along the order meets enough of them soon.
         """
-        chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
         with self.reading() as connection:
+            if indexed:
+                few = connection.execute(sa.select(jobs.c.seq).where(where).limit(FEW + 1)).scalars().all()
+                where = jobs.c.seq.in_(few) if len(few) <= FEW else where
+            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
             places = connection.execute(chosen.order_by(*order).limit(limit)).all()
             rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
             found = {row.seq: _record(row) for row in rows}

@@ -41,7 +41,7 @@ def create_app(settings: Settings) -> FastAPI:
         title="frit", version=openapi.version(), description=openapi.DESCRIPTION, lifespan=lifespan,
         generate_unique_id_function=lambda route: route.name,
     )  # fmt: skip
-    handle_problems(app)
+    handle_problems(app, [*api.routes, *plain.routes])
     app.include_router(api)
     app.include_router(plain)
 

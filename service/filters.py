@@ -161,8 +161,8 @@ def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -
     try:
         scalar = _order(by)
         limit = _limit(given.get("limit", [str(PAGE)])[-1])
-        if "cursor" in given:
-            where.append(_after(given["cursor"][-1], by, scalar))
+        if place := given.get("cursor", [""])[-1]:
+            where.append(_after(place, by, scalar))
     except WrongQueryError as error:
         wrong.append(error.field)
     if wrong:

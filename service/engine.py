@@ -16,7 +16,7 @@ from .results import Follower
 from .scheduler import Scheduler
 from .security import check_address
 from .settings import Settings
-from .store import Key, NewPoint, Store, SweepRecord
+from .store import Key, NewPoint, Store, StoreError, SweepRecord
 
 if TYPE_CHECKING:
     from frit.sweeps.definition import Sweep
@@ -44,7 +44,7 @@ class Engine:
             stack.callback(os.close, take(self.settings.data))
             try:
                 self.store = await asyncio.to_thread(Store, self.settings.data)
-            except IndexVersionError as error:
+            except (IndexVersionError, StoreError) as error:
                 raise EngineError(str(error)) from error
             stack.callback(self.store.close)
             self.hub = Hub()

@@ -52,6 +52,7 @@ Index("ix_jobs_queue", jobs.c.state, jobs.c.priority.desc(), jobs.c.seq)
 Index("ix_jobs_state_seq", jobs.c.state, jobs.c.seq)
 for key in ("mean_radius", "std_radius", "packing_density"):  # what sweeps are made of
     Index(f"ix_jobs_{key}", text(f"""json_extract("case", '$.particles.{key}')"""))
+Index("ix_jobs_vacancy_ratio", text("json_extract(result, '$.vacancy_ratio')"))  # what they lead to
 
 sweep_jobs = Table(
     "sweep_jobs",

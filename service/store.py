@@ -27,6 +27,7 @@ from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
+FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
 T = TypeVar("T")
 
@@ -143,6 +144,15 @@ class _Work:
     answer: Future[Any]
 
 
+@dataclass(frozen=True)
+class _Submission:
+    """Work that is done for many at once: a job to be queued."""
+
+    job: NewJob
+    key: Key | None
+    answer: Future[Any]
+
+
 class Store:
     """The index of one data folder. Methods that change it give a future, done once the change is durable."""
 
@@ -156,7 +166,11 @@ class Store:
         migrations.prepare(self.path)
         self._writer = _engine(self.path, writer=True)
         self._reader = _engine(self.path, writer=False)
-        self._waiting: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
+        try:
+            self._writer.connect().close()  # from now on there is a write-ahead log, and it is this writer's
+        except DBAPIError as error:
+            raise StoreError(f"{self.path}: {error.orig}") from error
+        self._waiting: queue.SimpleQueue[_Work | _Submission | None] = queue.SimpleQueue()
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
         self._closed = not writable
@@ -184,21 +198,32 @@ class Store:
 
     def _write(self) -> None:
         while (work := self._waiting.get()) is not None:
-            batch: list[_Work | None] = [work]
+            batch: list[_Work | _Submission | None] = [work]
             while len(batch) < BATCH and not self._waiting.empty():
                 batch.append(self._waiting.get())
             self._commit([work for work in batch if work is not None])
             if batch[-1] is None:
                 return
 
-    def _commit(self, batch: Sequence[_Work]) -> None:
+    def _commit(self, batch: Sequence[_Work | _Submission]) -> None:
         batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
-        done: list[tuple[_Work, Any]] = []
-        refused: list[tuple[_Work, Exception]] = []
+        submissions = [work for work in batch if isinstance(work, _Submission)]
+        done: list[tuple[_Work | _Submission, Any]] = []
+        refused: list[tuple[_Work | _Submission, Exception]] = []
         lines: list[str] = []
         try:
             with self._writer.connect() as connection, connection.begin():
+                if submissions:
+                    transaction = Transaction(connection)
+                    for submission, answer in zip(submissions, _submit(transaction, submissions), strict=True):
+                        if isinstance(answer, Exception):
+                            refused.append((submission, answer))
+                        else:
+                            done.append((submission, answer))
+                    lines += transaction.lines
                 for work in batch:
+                    if isinstance(work, _Submission):
+                        continue
                     try:
                         with connection.begin_nested():
                             transaction = Transaction(connection)
@@ -212,13 +237,13 @@ class Store:
         except (DBAPIError, OSError) as error:
             trouble = StoreError(f"{self.path}: {getattr(error, 'orig', None) or error}")
             trouble.__cause__ = error
-            for work in batch:
-                work.answer.set_exception(trouble)
+            for piece in batch:
+                piece.answer.set_exception(trouble)
             return
-        for work, reason in refused:
-            work.answer.set_exception(reason)
-        for work, answer in done:
-            work.answer.set_result(answer)
+        for piece, reason in refused:
+            piece.answer.set_exception(reason)
+        for piece, answer in done:
+            piece.answer.set_result(answer)
         for listener in self.listeners:
             listener()
 
@@ -242,17 +267,11 @@ class Store:
 
     def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
-
-        def effect(t: Transaction) -> Job:
-            if (known := _known(t, key)) is not None:
-                return _job(t.connection, known)
-            (row,) = _insert(t, [job])
-            _remember(t, key, row.id)
-            t.note(kind="job", id=row.id, name=job.name, ranks=job.ranks, priority=job.priority, tags=job.tags,
-                   time_limit=job.time_limit, case=job.case)  # fmt: skip
-            return row
-
-        return self.write(effect)
+        if self._closed:
+            raise StoreError("the index is closed")
+        submission = _Submission(job, key, Future())
+        self._waiting.put(submission)
+        return submission.answer
 
     def submit_sweep(
         self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
@@ -428,14 +447,20 @@ class Store:
             return [_record(row) for row in connection.execute(query if where is None else query.where(where))]
 
     def page(
-        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int, value: sa.ColumnElement[Any] | None
-    ) -> list[tuple[Job, Any]]:
+        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int,
+        value: sa.ColumnElement[Any] | None = None, indexed: bool = False,
+    ) -> list[tuple[Job, Any]]:  # fmt: skip
         """Jobs that fit, in order, each with the value it is ordered by.
 
-        The jobs are chosen first and read afterwards: sorting moves numbers, not cases.
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `indexed`: an index has what
+        the filter needs, but not in this order; so where few jobs fit they are found by it and sorted, and where many
+        do, a walk along the order meets enough of them soon.
         """
-        chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
         with self.reading() as connection:
+            if indexed:
+                few = connection.execute(sa.select(jobs.c.seq).where(where).limit(FEW + 1)).scalars().all()
+                where = jobs.c.seq.in_(few) if len(few) <= FEW else where
+            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
             places = connection.execute(chosen.order_by(*order).limit(limit)).all()
             rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
             found = {row.seq: _record(row) for row in rows}
@@ -672,6 +697,51 @@ def _retry(t: Transaction, job: Job) -> Job:
     return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None)
 
 
+def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReusedError]:
+    """Queue all that no key has brought before: a few statements, however many there are."""
+    texts = {f"{key.scope} {key.value}" for submission in wanted if (key := submission.key) is not None}
+    query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
+    # by key: the fingerprint of its request, and the job's id or its place among the new ones
+    seen: dict[str, tuple[str, str | int]] = {}
+    if texts:
+        seen = {row.key: (row.fingerprint, row.resource) for row in t.run(query)}
+    new: list[NewJob] = []
+    places: list[str | int | KeyReusedError] = []
+    for submission in wanted:
+        key = submission.key
+        text = "" if key is None else f"{key.scope} {key.value}"
+        fingerprint, place = seen.get(text, (None, None))
+        if key is not None and fingerprint is not None and fingerprint != key.fingerprint:
+            places.append(_reused(key))
+            continue
+        if place is None:
+            place = len(new)
+            new.append(submission.job)
+            if key is not None:
+                seen[text] = key.fingerprint, place
+        places.append(place)
+    made = _insert(t, new)
+    rows = [
+        {"key": text, "fingerprint": fingerprint, "resource": made[place].id, "created": time.time()}
+        for text, (fingerprint, place) in seen.items()
+        if isinstance(place, int)
+    ]
+    if rows:
+        t.run(idempotency.insert(), rows)
+    for job in made:
+        t.note(kind="job", id=job.id, name=job.name, ranks=job.ranks, priority=job.priority, tags=job.tags,
+               time_limit=job.time_limit, case=job.case)  # fmt: skip
+    return [
+        place if isinstance(place, KeyReusedError) else made[place] if isinstance(place, int)
+        else _job(t.connection, place)
+        for place in places
+    ]  # fmt: skip
+
+
+def _reused(key: Key) -> KeyReusedError:
+    return KeyReusedError(f"Idempotency-Key {key.value!r}: came before, with another request")
+
+
 def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
     """Queue jobs. The id is the beginning of the identity, with a number where a case comes again."""
     now, made = time.time(), list[dict[str, Any]]()
@@ -756,7 +826,7 @@ def _known(t: Transaction, key: Key | None) -> str | None:
     if (row := t.run(query).first()) is None:
         return None
     if row.fingerprint != key.fingerprint:
-        raise KeyReusedError(f"Idempotency-Key {key.value!r}: came before, with another request")
+        raise _reused(key)
     return str(row.resource)
 
 

@@ -15,7 +15,7 @@ from .migrations import IndexVersionError
 from .results import Follower
 from .scheduler import Scheduler
 from .settings import Settings
-from .store import Store
+from .store import Key, Store
 
 
 class EngineError(RuntimeError):
@@ -56,12 +56,12 @@ class Engine:
     async def __aexit__(self, *_: object) -> None:
         await self._stack.aclose()
 
-    async def cancel(self, identifier: str) -> Job:
-        """End a job: at once where it has no cores, else its runner is told.
+    async def cancel(self, identifier: str, key: Key | None = None) -> Job:
+        """End a job: at once where it has no cores, else its runner is told. A key that came before changes nothing.
 
-        Raises `TransitionError`, `NotFoundError`.
+        Raises `TransitionError`, `NotFoundError`, `KeyReusedError`.
         """
-        job = await asyncio.wrap_future(self.store.cancel(identifier))
+        job = await asyncio.wrap_future(self.store.cancel(identifier, key))
         if job.stopping:
             await self.scheduler.stop(job, "cancelled")
         return job

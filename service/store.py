@@ -24,7 +24,7 @@ from sqlalchemy.exc import DBAPIError
 
 from . import migrations
 from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
-from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps, tokens
+from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
 BUSY = 5.0  # seconds to wait for a lock that another program holds
@@ -344,14 +344,17 @@ class Store:
 
         return self.write(effect)
 
-    def cancel(self, identifier: str) -> "Future[Job]":
+    def cancel(self, identifier: str, key: Key | None = None) -> "Future[Job]":
         """End a job: at once where it has no cores, else it is marked and its runner must be told.
 
-        Raises `TransitionError` where it has ended already.
+        Raises `TransitionError` where it has ended already. With a key that came before nothing more is done.
         """
 
         def effect(t: Transaction) -> Job:
+            if (known := _known(t, key)) is not None:
+                return _job(t.connection, known)
             job = _job(t.connection, identifier)
+            _remember(t, key, job.id)
             if job.state is State.CANCELLED:
                 return job
             if job.state.active:
@@ -363,9 +366,20 @@ class Store:
 
         return self.write(effect)
 
-    def retry(self, identifier: str) -> "Future[Job]":
-        """Queue a job that ended without success again; it goes on from its checkpoint. Raises `TransitionError`."""
-        return self.write(lambda t: _retry(t, _job(t.connection, identifier)))
+    def retry(self, identifier: str, key: Key | None = None) -> "Future[Job]":
+        """Queue a job that ended without success again; it goes on from its checkpoint. Raises `TransitionError`.
+
+        With a key that came before nothing more is done.
+        """
+
+        def effect(t: Transaction) -> Job:
+            if (known := _known(t, key)) is not None:
+                return _job(t.connection, known)
+            job = _retry(t, _job(t.connection, identifier))
+            _remember(t, key, job.id)
+            return job
+
+        return self.write(effect)
 
     def ingest(self, seq: int, rows: Sequence[tuple[int, str]], times: Sequence[tuple[int, float]]) -> "Future[None]":
         """History rows (number, JSON line) and times of complete snapshots (number, time) of a job."""
@@ -407,6 +421,20 @@ class Store:
         query = sa.select(jobs).order_by(*(order or (jobs.c.seq.desc(),))).limit(limit)
         with self.reading() as connection:
             return [_record(row) for row in connection.execute(query if where is None else query.where(where))]
+
+    def page(
+        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int, value: sa.ColumnElement[Any] | None
+    ) -> list[tuple[Job, Any]]:
+        """Jobs that fit, in order, each with the value it is ordered by.
+
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases.
+        """
+        chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
+        with self.reading() as connection:
+            places = connection.execute(chosen.order_by(*order).limit(limit)).all()
+            rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
+            found = {row.seq: _record(row) for row in rows}
+        return [(found[seq], at) for seq, at in places]
 
     def queued(self, limit: int) -> list[tuple[int, int]]:
         """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
@@ -491,45 +519,63 @@ class Store:
                 SweepPoint(row.position, row.label, row.parameters, _record(row)) for row in connection.execute(query)
             ]
 
+    def new_in_sweeps(self, which: Sequence[int]) -> dict[int, int]:
+        """How many jobs of each sweep (by seq) were made with it."""
+        query = (
+            sa.select(sweep_jobs.c.sweep, sa.func.count()).join_from(sweep_jobs, jobs).join(sweeps)
+            .where(sweep_jobs.c.sweep.in_(which), jobs.c.created >= sweeps.c.created).group_by(sweep_jobs.c.sweep)
+        )  # fmt: skip
+        with self.reading() as connection:
+            found: dict[int, int] = dict(connection.execute(query).tuples().all())
+        return {seq: found.get(seq, 0) for seq in which}
+
+    def curves(self, sweep: int, observable: str) -> dict[int, list[tuple[float, float | None]]]:
+        """(time, value) of an observable along the history of each job (by seq) of a sweep (by seq)."""
+        value = sa.func.json_extract(history.c.data, f"$.{observable}")
+        mine = sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep)
+        query = sa.select(history.c.job, history.c.time, value).where(history.c.job.in_(mine))
+        found: dict[int, list[tuple[float, float | None]]] = {}
+        with self.reading() as connection:
+            for job, at, number in connection.execute(query.order_by(history.c.job, history.c.row)):
+                found.setdefault(job, []).append((at, number))
+        return found
+
+    def observables(self, sweep: int) -> list[str]:
+        """Names of the scalars in the history rows of a sweep's jobs, as the first row of each has them."""
+        mine = sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep)
+        each = sa.func.json_each(history.c.data).table_valued("key", "type")
+        query = (
+            sa.select(each.c.key).distinct().select_from(history).join(each, sa.true())
+            .where(history.c.job.in_(mine), history.c.row == 0, each.c.type.in_(["integer", "real", "null"]))
+        )  # fmt: skip
+        with self.reading() as connection:
+            return [row.key for row in connection.execute(query)]
+
     def identities(self, which: Sequence[str]) -> dict[str, Job]:
         """Of these identities, the newest job each has."""
         with self.reading() as connection:
             return {identity: _by_seq(connection, seq) for identity, seq in _existing(connection, which).items()}
 
+    def known(self, key: Key) -> str | None:
+        """The id of what a key made before. Raises `KeyReusedError`."""
+        with self.reading() as connection:
+            return _known(Transaction(connection), key)
+
     # --- tokens -------------------------------------------------------------------------------------------
 
-    def add_token(self, name: str, scope: str, digest: str) -> "Future[None]":
-        """Keep a token's hash. Raises `ValueError` where the name is taken."""
-
-        def effect(t: Transaction) -> None:
-            if t.run(sa.select(tokens.c.seq).where(tokens.c.name == name)).first() is not None:
-                raise ValueError(f"token {name!r}: the name is taken, also by a revoked token")
-            t.run(tokens.insert(), [{"name": name, "scope": scope, "hash": digest, "created": time.time()}])
-
-        return self.write(effect)
-
-    def revoke_token(self, name: str) -> "Future[None]":
-        """Let a token count no more. Raises `NotFoundError`."""
-
-        def effect(t: Transaction) -> None:
-            which = (tokens.c.name == name) & tokens.c.revoked.is_(None)
-            if t.run(tokens.update().where(which).values(revoked=time.time())).rowcount == 0:
-                raise NotFoundError(f"token {name!r}: there is none, or it is revoked")
-
-        return self.write(effect)
-
-    def tokens(self) -> list[Token]:
-        """All tokens, the revoked ones too."""
-        with self.reading() as connection:
-            found = connection.execute(sa.select(tokens).order_by(tokens.c.seq))
-            return [Token(row.name, row.scope, row.created, row.revoked) for row in found]
-
-    def token(self, digest: str) -> Token | None:
-        """The token with this hash, unless it is revoked."""
-        query = sa.select(tokens).where(tokens.c.hash == digest, tokens.c.revoked.is_(None))
-        with self.reading() as connection:
-            row = connection.execute(query).first()
-        return None if row is None else Token(row.name, row.scope, row.created, row.revoked)
+    def active_tokens(self) -> dict[str, Token]:
+        """The tokens that count now, by hash. Asked at every request: no layer between it and SQLite."""
+        try:
+            connection = self._reader.raw_connection()
+            try:
+                rows = connection.cursor().execute(
+                    "SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL"
+                )
+                return {hashed: Token(name, scope, created, None) for hashed, name, scope, created in rows}
+            finally:
+                connection.close()
+        except (DBAPIError, sqlite3.Error) as error:
+            raise StoreError(f"{self.path}: {error}") from error
 
 
 # --- engines ----------------------------------------------------------------------------------------------

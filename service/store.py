@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -23,11 +23,18 @@ from sqlalchemy.engine import Connection, Engine, Row
 from sqlalchemy.exc import DBAPIError
 
 from . import migrations
+from .files import flush_folder
 from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
 BUSY = 5.0  # seconds to wait for a lock that another program holds
+SUCCEEDED = 1 << 60  # more than any seq
+TROUBLE = {  # primary codes of SQLite's that tell of the database and its disk, not of one statement
+    sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PROTOCOL,
+    sqlite3.SQLITE_NOTADB,
+}  # fmt: skip
 T = TypeVar("T")
 
 
@@ -127,14 +134,15 @@ class Transaction:
 
     connection: Connection
     lines: list[str] = field(default_factory=list)
+    durable: bool = False  # whether somebody is told of something that only the lines keep when the database is lost
 
     def run(self, statement: sa.Executable, rows: Any = None) -> sa.CursorResult[Any]:
         """Execute; `rows` for many at once."""
         return cast("sa.CursorResult[Any]", self.connection.execute(statement, rows))
 
-    def note(self, **line: Any) -> None:
+    def note(self, kind: str, **line: Any) -> None:
         """A line of the journal: what a lost index is rebuilt from."""
-        self.lines.append(json.dumps({**line, "at": time.time()}) + "\n")
+        self.lines.append(json.dumps({"kind": kind, **line}) + "\n")
 
 
 @dataclass
@@ -153,29 +161,36 @@ class Store:
         migrations.prepare(self.path)
         self._writer = _engine(self.path, writer=True)
         self._reader = _engine(self.path, writer=False)
+        try:
+            self._writer.connect().close()  # the log must be there before the first reader is
+        except DBAPIError as error:
+            raise StoreError(f"{self.path}: {_words(error)}") from error
         self._waiting: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
-        self._closed = False
+        self._closed, self._door = False, threading.Lock()
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Finish what waits, and close."""
-        if not self._closed:
+        with self._door:
+            if self._closed:
+                return
             self._closed = True
             self._waiting.put(None)
-            self._thread.join()
-            self._writer.dispose()
-            self._reader.dispose()
+        self._thread.join()
+        self._writer.dispose()
+        self._reader.dispose()
 
     # --- the writer ---------------------------------------------------------------------------------------
 
     def write(self, effect: "Callable[[Transaction], T]") -> "Future[T]":
         """Have the effect done in a transaction; the future is done when it is durable."""
-        if self._closed:
-            raise StoreError("the index is closed")
         work = _Work(effect, Future())
-        self._waiting.put(work)
+        with self._door:
+            if self._closed:
+                raise StoreError("the index is closed")
+            self._waiting.put(work)
         return work.answer
 
     def _write(self) -> None:
@@ -188,41 +203,68 @@ class Store:
                 return
 
     def _commit(self, batch: Sequence[_Work]) -> None:
-        done: list[tuple[_Work, Any]] = []
+        batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]
+        answers: list[tuple[_Work, Any]] = []
         refused: list[tuple[_Work, Exception]] = []
-        lines: list[str] = []
+        done: list[Transaction] = []
         try:
-            with self._writer.connect() as connection, connection.begin():
+            with self._writer.connect() as connection, self._journalled() as write, connection.begin():
                 for work in batch:
+                    transaction = Transaction(connection)
                     try:
                         with connection.begin_nested():
-                            transaction = Transaction(connection)
-                            done.append((work, work.effect(transaction)))
-                            lines += transaction.lines
-                    except DBAPIError:
-                        raise  # the whole database is in trouble
+                            answer = work.effect(transaction)
+                        answers.append((work, answer))
+                        done.append(transaction)
                     except Exception as error:
+                        if _spoils_all(connection, error):
+                            raise
                         refused.append((work, error))
-            self._append(lines)
-        except (DBAPIError, OSError) as error:
-            trouble = StoreError(f"{self.path}: {getattr(error, 'orig', None) or error}")
+                write("".join(line for transaction in done for line in transaction.lines), any(t.durable for t in done))
+        except Exception as error:
+            trouble = StoreError(f"{self.path}: {_words(error)}")
             trouble.__cause__ = error
             for work in batch:
                 work.answer.set_exception(trouble)
             return
         for work, reason in refused:
             work.answer.set_exception(reason)
-        for work, answer in done:
+        for work, answer in answers:
             work.answer.set_result(answer)
         for listener in self.listeners:
             listener()
 
-    def _append(self, lines: Sequence[str]) -> None:
-        if lines:
-            with open(self.journal, "a", encoding="utf-8") as file:
-                file.write("".join(lines))
-                file.flush()
-                os.fsync(file.fileno())
+    @contextmanager
+    def _journalled(self) -> Iterator[Callable[[str, bool], None]]:
+        """Append to the journal; what was appended is taken back where the block ends badly.
+
+        A crash in between leaves lines that the database does not have, of what nobody was told.
+        """
+        before: list[int] = []
+
+        def write(text: str, durable: bool) -> None:
+            if not text:
+                return
+            fresh = not self.journal.exists()
+            with open(self.journal, "a+b", buffering=0) as file:
+                size = file.seek(0, os.SEEK_END)
+                before.append(size)
+                torn = size > 0 and os.pread(file.fileno(), 1, size - 1) != b"\n"  # by a crash: not to spoil a line
+                data = memoryview((b"\n" if torn else b"") + text.encode())
+                while data:
+                    data = data[file.write(data) :]
+                if durable:
+                    os.fsync(file.fileno())
+            if fresh:
+                flush_folder(self.journal.parent)
+
+        try:
+            yield write
+        except BaseException:
+            if before:
+                with suppress(OSError):
+                    os.truncate(self.journal, before[0])
+            raise
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -230,8 +272,8 @@ class Store:
         try:
             with self._reader.connect() as connection:
                 yield connection
-        except DBAPIError as error:
-            raise StoreError(f"{self.path}: {error.orig}") from error
+        except (DBAPIError, sa.exc.TimeoutError) as error:
+            raise StoreError(f"{self.path}: {_words(error)}") from error
 
     # --- submitting ---------------------------------------------------------------------------------------
 
@@ -243,8 +285,6 @@ class Store:
                 return _job(t.connection, known)
             (row,) = _insert(t, [job])
             _remember(t, key, row.id)
-            t.note(kind="job", id=row.id, name=job.name, ranks=job.ranks, priority=job.priority, tags=job.tags,
-                   time_limit=job.time_limit, case=job.case)  # fmt: skip
             return row
 
         return self.write(effect)
@@ -257,17 +297,18 @@ class Store:
         def effect(t: Transaction) -> SweepRecord:
             if (known := _known(t, key)) is not None:
                 return _sweep(t.connection, known)
-            seq, identifier = _insert_sweep(t, name, definition, duplicates)
+            row = _insert_sweep(t, name, definition, duplicates)
+            seq, identifier = row["seq"], row["id"]
             numbers = _jobs_of_points(t, points)
+            members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
+            t.note("sweep", **row, points=members)
             rows = [
-                {"sweep": seq, "position": i, "job": numbers[point.job.identity], "name": point.job.name,
-                 "parameters": dict(point.parameters)}
-                for i, point in enumerate(points)
-            ]  # fmt: skip
+                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": parameters}
+                for i, (job, label, parameters) in enumerate(members)
+            ]
             if rows:
                 t.run(sweep_jobs.insert(), rows)
             _remember(t, key, identifier)
-            t.note(kind="sweep", id=identifier, name=name, definition=definition)
             return _sweep(t.connection, identifier)
 
         return self.write(effect)
@@ -287,6 +328,7 @@ class Store:
                 _move(t, job, Move.CLAIM, None, attempt=job.attempt + 1, started=job.started or now, ended=None)
                 row = {"job": seq, "number": job.attempt + 1, "cores": list(cores), "claimed": now}
                 t.run(attempts.insert(), [row])
+                t.note("attempt", **row)
                 claimed.append(_by_seq(t.connection, seq))
             return claimed
 
@@ -299,8 +341,7 @@ class Store:
             job = _job(t.connection, identifier)
             if (job.attempt, job.state) != (attempt, State.STARTING):
                 return job
-            which = (attempts.c.job == job.seq) & (attempts.c.number == attempt)
-            t.run(attempts.update().where(which).values(pid=pid, pid_start=pid_start, boot=boot))
+            _set_attempt(t, job, pid=pid, pid_start=pid_start, boot=boot)
             return _move(t, job, Move.START, None)
 
         return self.write(effect)
@@ -317,11 +358,8 @@ class Store:
             if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
                 broke, move = False, Move.STOP
             state = after(job.state, move)
-            which = (attempts.c.job == job.seq) & (attempts.c.number == end.attempt)
-            t.run(
-                attempts.update().where(which).values(
-                    ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
-                )
+            _set_attempt(
+                t, job, ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
             )  # fmt: skip
             failures = job.failures + 1 if broke else 0
             return _move(
@@ -358,10 +396,12 @@ class Store:
             if job.state is State.CANCELLED:
                 return job
             if job.state.active:
-                t.run(jobs.update().where(jobs.c.seq == job.seq).values(stopping=True))
+                _set(t, job, stopping=True)
+                t.durable = True
                 return _by_seq(t.connection, job.seq)
             if job.state in (State.ERROR, State.LOST) and not job.retrying:
                 raise TransitionError(job.state, Move.CANCEL)
+            t.durable = True
             return _move(t, job, Move.CANCEL, None, retrying=False, ended=time.time())
 
         return self.write(effect)
@@ -382,7 +422,10 @@ class Store:
         return self.write(effect)
 
     def ingest(self, seq: int, rows: Sequence[tuple[int, str]], times: Sequence[tuple[int, float]]) -> "Future[None]":
-        """History rows (number, JSON line) and times of complete snapshots (number, time) of a job."""
+        """History rows (number, JSON line) and times of complete snapshots (number, time) of a job.
+
+        Of a history that was cut back, what came after the first of these rows is forgotten.
+        """
 
         def effect(t: Transaction) -> None:
             if rows:
@@ -392,7 +435,8 @@ class Store:
                      "data": line}
                     for (number, line), tree in zip(rows, trees, strict=True)
                 ]  # fmt: skip
-                t.run(history.insert().prefix_with("OR REPLACE"), values)
+                t.run(history.delete().where(history.c.job == seq, history.c.row >= rows[0][0]))
+                t.run(history.insert(), values)
             if times:
                 values = [{"job": seq, "number": number, "time": at} for number, at in times]
                 t.run(snapshots.insert().prefix_with("OR REPLACE"), values)
@@ -607,6 +651,27 @@ def _compact(tree: Any) -> str:
     return json.dumps(tree, separators=(",", ":"), allow_nan=False)
 
 
+def _spoils_all(connection: Connection, error: Exception) -> bool:
+    """Whether an error ended the whole transaction, or tells of trouble with the database that others will have too."""
+    raw = connection.connection.dbapi_connection
+    return _code(error) in TROUBLE or not getattr(raw, "in_transaction", False)
+
+
+def _code(error: BaseException) -> int | None:
+    """SQLite's primary code."""
+    code = getattr(getattr(error, "orig", error), "sqlite_errorcode", None)
+    return None if code is None else int(code) & 0xFF
+
+
+def _words(error: BaseException) -> str:
+    """What went wrong first: SQLite's word, or the system's; not of the savepoint that was lost by it."""
+    first = error
+    while _code(first) not in TROUBLE and first.__context__ is not None:
+        first = first.__context__
+    told = first if _code(first) in TROUBLE else error
+    return str(getattr(told, "orig", None) or told)
+
+
 # --- pieces of transactions -------------------------------------------------------------------------------
 
 
@@ -648,15 +713,27 @@ def _attempts(connection: Connection, job: Job) -> list[Attempt]:
 
 def _move(t: Transaction, job: Job, move: Move, message: str | None, **values: Any) -> Job:
     """Change a job's state and tell it as an event."""
-    state = after(job.state, move)
-    changes = {"state": state, "message": message, **values}
-    t.run(jobs.update().where(jobs.c.seq == job.seq).values(changes))
-    t.run(events.insert(), [{"job": job.seq, "at": time.time(), "state": state, "message": message}])
+    state, now = after(job.state, move), time.time()
+    _set(t, job, event=now, state=state, message=message, **values)
+    t.run(events.insert(), [{"job": job.seq, "at": now, "state": state, "message": message}])
     return _by_seq(t.connection, job.seq)
+
+
+def _set(t: Transaction, job: Job, event: float | None = None, **values: Any) -> None:
+    """Change columns of a job; `event`: when that made an event."""
+    t.run(jobs.update().where(jobs.c.seq == job.seq).values(values))
+    t.note("set", job=job.seq, event=event, values=values)
+
+
+def _set_attempt(t: Transaction, job: Job, **values: Any) -> None:
+    """Change columns of a job's present attempt."""
+    t.run(attempts.update().where(attempts.c.job == job.seq, attempts.c.number == job.attempt).values(values))
+    t.note("attempt", job=job.seq, number=job.attempt, **values)
 
 
 def _retry(t: Transaction, job: Job) -> Job:
     """A new life: what broke before does not count."""
+    t.durable = True
     return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None)
 
 
@@ -678,6 +755,9 @@ def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
     last = t.run(sa.select(sa.func.max(jobs.c.seq))).scalar_one()
     numbers = range(last - len(made) + 1, last + 1)
     t.run(events.insert(), [{"job": seq, "at": now, "state": State.QUEUED} for seq in numbers])
+    for seq, row in zip(numbers, made, strict=True):
+        t.note("job", seq=seq, **row)
+    t.durable = True
     empty = {"message": None, "started": None, "ended": None, "core_seconds": None}
     return [
         Job(**{**row, **empty, "seq": seq, "tags": tuple(row["tags"])})
@@ -695,30 +775,39 @@ def _existing_ids(connection: Connection, which: Sequence[str]) -> dict[str, int
 
 
 def _existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
-    """The seq of the newest job of each identity."""
+    """The seq of a job of each identity: of one that succeeded, if any did, else of the newest."""
+    done = sa.case((jobs.c.state == State.SUCCEEDED, SUCCEEDED), else_=0)
     found: dict[str, int] = {}
     for k in range(0, len(which), 500):
-        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq)).where(jobs.c.identity.in_(which[k : k + 500]))
-        found |= {identity: seq for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
+        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq + done)).where(jobs.c.identity.in_(which[k : k + 500]))
+        found |= {identity: seq % SUCCEEDED for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
     return found
 
 
 def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
     """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done."""
     numbers = _existing(t.connection, [point.job.identity for point in points])
-    for seq in numbers.values():
-        job = _by_seq(t.connection, seq)
-        if job.final and job.state not in (State.SUCCEEDED, State.FAILED):
-            _retry(t, job)
-    new = _insert(t, [point.job for point in points if point.job.identity not in numbers])
+    undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
+    old = list(numbers.values())
+    for k in range(0, len(old), 500):
+        query = sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]), undone)
+        for row in t.run(query).all():
+            _retry(t, _record(row))
+    missing: dict[str, NewJob] = {}
+    for point in points:
+        if point.job.identity not in numbers:
+            missing.setdefault(point.job.identity, point.job)
+    new = _insert(t, list(missing.values()))
     return numbers | {job.identity: job.seq for job in new}
 
 
-def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> tuple[int, str]:
-    count = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
-    identifier = f"s{count}"
-    row = {"id": identifier, "name": name, "definition": definition, "duplicates": duplicates, "created": time.time()}
-    return int(t.run(sweeps.insert().values(row)).lastrowid), identifier
+def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> dict[str, Any]:
+    seq = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
+    row = {"seq": seq, "id": f"s{seq}", "name": name, "definition": definition, "duplicates": duplicates}
+    row["created"] = time.time()
+    t.run(sweeps.insert(), [row])
+    t.durable = True
+    return row
 
 
 def _sweep(connection: Connection, identifier: str) -> SweepRecord:
@@ -750,5 +839,7 @@ def _known(t: Transaction, key: Key | None) -> str | None:
 
 def _remember(t: Transaction, key: Key | None, resource: str) -> None:
     if key is not None:
-        row = {"key": f"{key.scope} {key.value}", "fingerprint": key.fingerprint, "resource": resource}
-        t.run(idempotency.insert(), [{**row, "created": time.time()}])
+        named = {"key": f"{key.scope} {key.value}", "fingerprint": key.fingerprint, "resource": resource}
+        row = {**named, "created": time.time()}
+        t.run(idempotency.insert(), [row])
+        t.note("key", **row)

@@ -20,6 +20,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from . import commands_index
 from .launch import Launch, LaunchError, Outcome, read_record
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
@@ -32,6 +33,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(commands_index.db, name="db")
 
 
 def at_least_one(ranks: int | None) -> int | None:

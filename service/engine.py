@@ -15,7 +15,7 @@ from .migrations import IndexVersionError
 from .results import Follower
 from .scheduler import Scheduler
 from .settings import Settings
-from .store import Key, Store
+from .store import Key, Store, StoreError
 
 
 class EngineError(RuntimeError):
@@ -39,7 +39,7 @@ class Engine:
             stack.callback(os.close, take(self.settings.data))
             try:
                 self.store = await asyncio.to_thread(Store, self.settings.data)
-            except IndexVersionError as error:
+            except (IndexVersionError, StoreError) as error:
                 raise EngineError(str(error)) from error
             stack.callback(self.store.close)
             self.hub = Hub()
@@ -85,8 +85,7 @@ def take(data: Path) -> int:
         (data / "runs").mkdir(parents=True, exist_ok=True)
         lock = try_lock(data / "lock")
         if lock is not None:
-            os.ftruncate(lock, 0)
-            os.write(lock, f"{os.getpid()}\n".encode())
+            sign(lock)
     except OSError as error:
         reasons = {errno.EROFS: "it is read-only", errno.EACCES: "this user may not write there"}
         reason = reasons.get(error.errno or 0, error.strerror)
@@ -95,3 +94,13 @@ def take(data: Path) -> int:
         owner = (data / "lock").read_text().strip()
         raise EngineError(f"data = {data}: in use by process {owner}: one service per data folder")
     return lock
+
+
+def sign(lock: int) -> None:
+    """Write into the lock who holds it; where that fails, it is let go."""
+    try:
+        os.ftruncate(lock, 0)
+        os.write(lock, f"{os.getpid()}\n".encode())
+    except OSError:
+        os.close(lock)
+        raise

@@ -34,6 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(commands_index.db, name="db")
+app.command()(commands_index.reindex)
 
 
 def at_least_one(ranks: int | None) -> int | None:

@@ -1,5 +1,6 @@
 """`frit db upgrade` and `frit reindex`: care for the index of a data folder while no service runs on it."""
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +32,35 @@ def upgrade(data: Data = Path("data")) -> None:
         except migrations.IndexVersionError as error:
             refuse(str(error))
     typer.echo(f"{path}: version {newest}" + (f", was {before}, which is kept as {copy}" if copy else " already"))
+
+
+def reindex(
+    data: Data = Path("data"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
+) -> None:
+    """Make a lost or damaged index again from the journal and the run directories; what is left of it is kept."""
+    from .cli import refuse
+    from .engine import EngineError
+    from .reindex import rebuild
+    from .settings import Settings
+    from .store import StoreError
+
+    try:
+        made = rebuild(data, Settings(data=data).attempts)
+    except (EngineError, StoreError, OSError) as error:
+        refuse(str(error))
+    for problem in made.problems:
+        typer.echo(problem, err=True)
+    counts = {"jobs": sum(made.states.values()), "sweeps": made.sweeps, "states": made.states}
+    if as_json:
+        typer.echo(json.dumps({**counts, "aside": made.aside and str(made.aside), "problems": made.problems}, indent=2))
+        return
+    typer.echo(f"{data / 'frit.db'}: {counts['jobs']} jobs, {made.sweeps} sweeps")
+    for state, count in made.states.items():
+        typer.echo(f"{state:12}{count}")
+    if made.aside:
+        typer.echo(f"the old index is kept as {made.aside}")
+    typer.echo("tokens are nowhere but in an index: make new ones with `frit token create`")
 
 
 @contextmanager

@@ -258,5 +258,6 @@ def make_directory(directory: Path, job: Job) -> None:
         beside = submitted.with_name("submitted.json.new")
         beside.write_text(job.case)
         os.replace(beside, submitted)
-    record = {key: getattr(job, key) for key in ("id", "name", "ranks", "priority", "tags", "time_limit", "created")}
+    keys = ("seq", "id", "identity", "name", "ranks", "priority", "tags", "time_limit", "created")
+    record = {key: getattr(job, key) for key in keys}
     write_json(directory / "job.json", record, durable=False)

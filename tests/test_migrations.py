@@ -106,6 +106,7 @@ def expressions(connection: sa.Connection) -> set[tuple[str, str]]:
 
 
 @pytest.mark.filterwarnings("ignore:Skipped unsupported reflection of expression-based index")
+@pytest.mark.filterwarnings("ignore:autogenerate skipping metadata-specified expression-based index")
 @pytest.mark.parametrize("how", ["new", "upgraded"])
 def test_the_schema_is_that_of_the_tables(old: Path, how: str) -> None:
     path = old / "frit.db"

@@ -10,7 +10,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import timedelta
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import monotonic
@@ -20,8 +19,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from . import commands_index
+from . import commands_index, commands_server, commands_sweep, commands_token
 from .launch import Launch, LaunchError, Outcome, read_record
+from .words import AsJson, cell, in_words, refuse
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
@@ -35,6 +35,8 @@ app = typer.Typer(
 )
 app.add_typer(commands_index.db, name="db")
 app.command()(commands_index.reindex)
+app.add_typer(commands_sweep.app, name="sweep")
+app.add_typer(commands_token.app, name="token")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -46,20 +48,12 @@ def at_least_one(ranks: int | None) -> int | None:
 
 CaseFile = Annotated[Path, typer.Argument(metavar="CASE.toml", exists=True, dir_okay=False, help="Or JSON.")]
 Ranks = Annotated[int, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False)]
 
 
 def main() -> None:
     """Entry point of the console script."""
     app()
-
-
-def refuse(*lines: str) -> NoReturn:
-    """Say on stderr what is wrong with the input, and leave with 2."""
-    for line in lines:
-        typer.echo(line, err=True)
-    raise typer.Exit(2)
 
 
 def show_version(wanted: bool) -> None:
@@ -146,6 +140,9 @@ def plot(
         refuse(str(error))
 
 
+commands_server.add_to(app)
+
+
 @app.command()
 def schema() -> None:
     """JSON Schema of the case file."""
@@ -214,22 +211,6 @@ def progress_bar() -> Iterator[tuple[Progress, TaskID]]:
         yield bar, bar.add_task("starting", total=None)
 
 
-def in_words(progress: dict[str, Any]) -> str:
-    """A progress line; what rank 0 does not know yet is a dash."""
-
-    def word(key: str, form: str) -> str:
-        value = progress.get(key)
-        return "-" if value is None else format(value, form)
-
-    seconds = progress.get("remaining")
-    left = "-" if seconds is None else timedelta(seconds=round(seconds))
-    return (
-        f"t {word('time', '.4g')}/{word('end', '.4g')} step {word('step', 'd')}"
-        f" {word('evaluations_per_second', '.3g')} ev/s live {word('live_fraction', '.0%')}"
-        f" vacancy {word('vacancy_ratio', '.4f')} {left} left"
-    )
-
-
 def report(
     directory: Path, outcome: Outcome, progress: dict[str, Any], wall_time: float | None, as_json: bool
 ) -> None:
@@ -247,11 +228,6 @@ def report(
         typer.echo("\n".join(filter(None, lines)), err=True)
     elif outcome.state == "interrupted":
         typer.echo(f"interrupted ({outcome.message}); `frit resume {directory}` goes on", err=True)
-
-
-def cell(value: object) -> str:
-    """Of the summary's table."""
-    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def summarise(

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from .words import AsJson, refuse
+
 db = typer.Typer(help="The index of a data folder.", no_args_is_help=True)
 
 Data = Annotated[
@@ -20,7 +22,6 @@ Data = Annotated[
 def upgrade(data: Data = Path("data")) -> None:
     """Bring the index to the version that this frit needs; a copy of the old one is kept."""
     from . import migrations
-    from .cli import refuse
 
     path = data.absolute() / "frit.db"
     with alone(data):
@@ -36,10 +37,9 @@ def upgrade(data: Data = Path("data")) -> None:
 
 def reindex(
     data: Data = Path("data"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a lost or damaged index again from the journal and the run directories; what is left of it is kept."""
-    from .cli import refuse
     from .engine import EngineError
     from .reindex import rebuild
     from .settings import Settings
@@ -66,7 +66,6 @@ def reindex(
 @contextmanager
 def alone(data: Path) -> Iterator[None]:
     """Hold the data folder; refuse where a service does."""
-    from .cli import refuse
     from .engine import EngineError, take
 
     try:

@@ -5,17 +5,22 @@ import errno
 import os
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from .backends.local import LocalBackend
 from .files import try_lock
 from .hub import Hub
-from .jobs import Job
+from .jobs import Job, NewJob
 from .migrations import IndexVersionError
 from .results import Follower
 from .scheduler import Scheduler
+from .security import check_address
 from .settings import Settings
-from .store import Key, Store, StoreError
+from .store import Key, NewPoint, Store, StoreError, SweepRecord
+
+if TYPE_CHECKING:
+    from frit.sweeps.definition import Sweep
+    from frit.sweeps.expand import Expansion
 
 
 class EngineError(RuntimeError):
@@ -66,6 +71,15 @@ class Engine:
             await self.scheduler.stop(job, "cancelled")
         return job
 
+    async def submit_sweep(self, sweep: "Sweep", expansion: "Expansion", key: Key | None = None) -> SweepRecord:
+        """Queue what is missing of a sweep."""
+        points = [
+            NewPoint(NewJob(p.case, p.identity, p.name, sweep.ranks, sweep.priority, sweep.tags), p.parameters)
+            for p in expansion.points
+        ]
+        made = self.store.submit_sweep(sweep.name, sweep.resolved_json(), points, expansion.duplicates, key)
+        return await asyncio.wrap_future(made)
+
     def trouble(self) -> str | None:
         """Why no job can be started or recorded now; None: all is well."""
         return self.scheduler.trouble
@@ -77,6 +91,21 @@ class Engine:
     def run_directory(self, identifier: str) -> Path:
         """Where a job's files are."""
         return self.settings.runs / identifier
+
+
+def check(settings: Settings) -> None:
+    """Say early why a service cannot be started. Raises `EngineError`, `AddressError`."""
+    lock = take(settings.data)
+    try:
+        store = Store(settings.data)
+        try:
+            check_address(settings, store)
+        finally:
+            store.close()
+    except (IndexVersionError, StoreError) as error:
+        raise EngineError(str(error)) from error
+    finally:
+        os.close(lock)
 
 
 def take(data: Path) -> int:

@@ -13,7 +13,7 @@ class Hub:
 
     def notify(self) -> None:
         """Something has happened."""
-        with suppress(RuntimeError):  # the loop is closed: nobody waits
+        with suppress(RuntimeError):  # the loop has ended meanwhile: nobody waits any more
             self._loop.call_soon_threadsafe(self._wake)
 
     def _wake(self) -> None:

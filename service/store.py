@@ -154,31 +154,37 @@ class _Work:
 class Store:
     """The index of one data folder. Methods that change it give a future, done once the change is durable."""
 
-    def __init__(self, folder: Path) -> None:
-        """Open an up-to-date index; make it where there is none. Raises `StoreError`."""
+    def __init__(self, folder: Path, writable: bool = True) -> None:
+        """Open an up-to-date index; make it where there is none. Raises `IndexVersionError`, `StoreError`.
+
+        writable: False for a look beside the service that writes; there can be one writer only.
+        """
         self.path = folder.absolute() / "frit.db"
         self.journal = folder.absolute() / "submitted.jsonl"
         migrations.prepare(self.path)
         self._writer = _engine(self.path, writer=True)
         self._reader = _engine(self.path, writer=False)
-        try:
-            self._writer.connect().close()  # the log must be there before the first reader is
-        except DBAPIError as error:
-            raise StoreError(f"{self.path}: {_words(error)}") from error
+        if writable:
+            try:
+                self._writer.connect().close()  # the log must be there before the first reader is
+            except DBAPIError as error:
+                raise StoreError(f"{self.path}: {_words(error)}") from error
         self._waiting: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
-        self._closed, self._door = False, threading.Lock()
+        self._door = threading.Lock()
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
-        self._thread.start()
+        self._closed = not writable
+        if writable:
+            self._thread.start()
 
     def close(self) -> None:
         """Finish what waits, and close."""
         with self._door:
-            if self._closed:
-                return
-            self._closed = True
-            self._waiting.put(None)
-        self._thread.join()
+            if not self._closed:
+                self._closed = True
+                self._waiting.put(None)
+        if self._thread.is_alive():
+            self._thread.join()
         self._writer.dispose()
         self._reader.dispose()
 
@@ -189,7 +195,7 @@ class Store:
         work = _Work(effect, Future())
         with self._door:
             if self._closed:
-                raise StoreError("the index is closed")
+                raise StoreError(f"{self.path}: closed, or opened for reading only")
             self._waiting.put(work)
         return work.answer
 
@@ -203,7 +209,7 @@ class Store:
                 return
 
     def _commit(self, batch: Sequence[_Work]) -> None:
-        batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]
+        batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
         answers: list[tuple[_Work, Any]] = []
         refused: list[tuple[_Work, Exception]] = []
         done: list[Transaction] = []
@@ -570,7 +576,7 @@ class Store:
             .where(sweep_jobs.c.sweep.in_(which), jobs.c.created >= sweeps.c.created).group_by(sweep_jobs.c.sweep)
         )  # fmt: skip
         with self.reading() as connection:
-            found: dict[int, int] = dict(connection.execute(query).tuples().all())
+            found = {seq: n for seq, n in connection.execute(query)}
         return {seq: found.get(seq, 0) for seq in which}
 
     def curves(self, sweep: int, observable: str) -> dict[int, list[tuple[float, float | None]]]:
@@ -604,6 +610,13 @@ class Store:
         """The id of what a key made before. Raises `KeyReusedError`."""
         with self.reading() as connection:
             return _known(Transaction(connection), key)
+
+    def measured(self, limit: int = 1000) -> list[tuple[str, float]]:
+        """The case and the core-seconds of the last jobs that succeeded at the first attempt."""
+        fits = (jobs.c.state == State.SUCCEEDED) & (jobs.c.attempt == 1) & jobs.c.core_seconds.is_not(None)
+        query = sa.select(jobs.c.case, jobs.c.core_seconds).where(fits).order_by(jobs.c.seq.desc()).limit(limit)
+        with self.reading() as connection:
+            return [(row.case, row.core_seconds) for row in connection.execute(query)]
 
     # --- tokens -------------------------------------------------------------------------------------------
 

@@ -231,6 +231,7 @@ def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
     record = {
         "state": "running",
         "message": None,
+        "retry": False,
         "case": case.identity(),
         "name": case.name,
         "ranks": ranks,
@@ -244,11 +245,11 @@ def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
     output.write_json(path, record)
 
 
-def record_end(directory: Path, state: str, message: str | None) -> None:
-    """How it ended, into run.json; the message into log.txt too."""
+def record_end(directory: Path, state: str, message: str | None, retry: bool = False) -> None:
+    """How it ended, into run.json; the message into log.txt too. retry: the machinery broke, not the case."""
     path = directory / "run.json"
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    record |= {"state": state, "message": message, "end": output.now()}
+    record |= {"state": state, "message": message, "retry": retry, "end": output.now()}
     output.write_json(path, record)
     with open(directory / "log.txt", "a") as log:
         log.write(f"{output.now()} {state}{': ' + message if message else ''}\n")
@@ -281,7 +282,7 @@ def give_up(error: BaseException, ranks: Ranks, directory: Path) -> int:
             traceback.print_exception(error)
             with open(directory / "log.txt", "a") as log:
                 log.write(where + "".join(traceback.format_exception(error)))
-        record_end(directory, state, message)
+        record_end(directory, state, message, retry=not refused)
     finally:
         if ranks.size > 1:
             ranks.abort(EXIT_STATUS[state])

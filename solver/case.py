@@ -14,7 +14,9 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from itertools import count, pairwise, takewhile
+from operator import ge
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -26,6 +28,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    ModelWrapValidatorHandler,
     Tag,
     ValidationError,
     ValidationInfo,
@@ -36,6 +39,8 @@ from scipy.spatial import cKDTree
 
 from .arrays import Flags, Floats
 
+CANONICAL = json.JSONEncoder(sort_keys=True)
+PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
 # --- vocabulary
@@ -95,33 +100,64 @@ class Table(BaseModel):
     switches: ClassVar[tuple[str, ...]] = ()
     owned: ClassVar[Mapping[tuple[str, ...], Mapping[str, Any]]] = {(): {}}
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _complete(cls, tree: object) -> object:
-        if not isinstance(tree, Mapping):
+    def _fit_switches(cls, tree: object, complete: ModelWrapValidatorHandler[Self]) -> Self:
+        """Fill in what goes with the setting of the switches, refuse what does not. A finished table passes."""
+        if type(tree) is cls:
             return tree
+        if not isinstance(tree, Mapping):
+            return complete(tree)
         given = {key: value for key, value in tree.items() if value is not None}
-        setting = tuple(str(given.get(switch, cls.model_fields[switch].default)) for switch in cls.switches)
-        defaults = {key: value for key, value in cls.owned.get(setting, {}).items() if value is not ...}
-        return defaults | given
+        if not cls.switches:
+            return complete(given)
+        setting = tuple([str(given.get(switch, default)) for switch, default in _switches(cls)])
+        table = complete(_defaults(cls, setting) | given)
+        _refuse(table._misfits())
+        return table
 
-    @model_validator(mode="after")
-    def _fields_fit_switches(self) -> Self:
-        setting = tuple(getattr(self, switch) for switch in self.switches)
-        said = [f"{switch} = {getattr(self, switch)!r}" for switch in self.switches]
-        words = ", ".join(said)
-        if setting not in self.owned:
-            raise CaseError([Problem(self.switches[-1], setting[-1], f"not possible with {said[0]}")])
-        own = self.owned[setting]
-        names = {name for fields in self.owned.values() for name in fields}
-        given = {name: value for name in sorted(names) if (value := getattr(self, name)) not in (None, ())}
-        missing = [name for name, default in own.items() if default is ... and name not in given]
-        takes = f"does not belong to {words}, which takes {', '.join(own)}"
-        _refuse(
-            [Problem(name, None, f"must be given with {words}{_about(type(self), name)}") for name in missing]
-            + [Problem(name, value, takes) for name, value in given.items() if name not in own]
-        )
-        return self
+    def _misfits(self) -> Iterator[Problem]:
+        fields = vars(self)
+        setting = tuple([fields[switch] for switch in self.switches])
+        own = self.owned.get(setting)
+        given = [name for name in _owned(type(self)) if fields[name] not in (None, ())]
+        said = [f"{switch} = {value!r}" for switch, value in zip(self.switches, setting, strict=True)]
+        if own is None:
+            yield Problem(self.switches[-1], setting[-1], f"not possible with {said[0]}")
+            return
+        for name, default in own.items():
+            if default is ... and name not in given:
+                yield Problem(name, None, f"must be given with {', '.join(said)}{_about(type(self), name)}")
+        for name in given:
+            if name not in own:
+                takes = f"does not belong to {', '.join(said)}, which takes {', '.join(own)}"
+                yield Problem(name, fields[name], takes)
+
+    def tree(self) -> dict[str, Any]:
+        """The table as plain values, without the fields that are absent."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
+        """What of the table's tree changes the result."""
+        return tree
+
+
+@cache
+def _switches(table: type[Table]) -> tuple[tuple[str, Any], ...]:
+    """The switches and their defaults."""
+    return tuple((switch, table.model_fields[switch].default) for switch in table.switches)
+
+
+@lru_cache(maxsize=64)
+def _defaults(table: type[Table], setting: tuple[str, ...]) -> dict[str, Any]:
+    """What a setting of the switches fills in."""
+    return {key: value for key, value in table.owned.get(setting, {}).items() if value is not ...}
+
+
+@cache
+def _owned(table: type[Table]) -> tuple[str, ...]:
+    """The fields of a table that go with some settings of its switches only."""
+    return tuple(sorted({name for fields in table.owned.values() for name in fields}))
 
 
 def _about(table: type[BaseModel], field: str) -> str:
@@ -150,6 +186,12 @@ class Nodes(Table):
     """h, nm: nodal spacing (lattice, gmsh)"""
     path: Text | None = None
     """mesh of triangles or tetrahedra; relative to the case file (file)"""
+
+    def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
+        """A mesh file counts by its content, wherever it is."""
+        if self.path is None:
+            return tree
+        return tree | {"path": hashlib.sha256(Path(self.path).read_bytes()).hexdigest()}
 
 
 class ShapeFunctions(Table):
@@ -212,6 +254,10 @@ class Particles(Table):
             raise CaseError([Problem("packing_density", self.packing_density, "give either this or count")])
         return self
 
+    def tree(self) -> dict[str, Any]:
+        """Lists of another source or shape are absent, not empty."""
+        return {key: value for key, value in super().tree().items() if value != []}
+
     def extents(self) -> tuple[Floats, Floats]:
         """Centres, and half widths along the axes, of a list: both (particles, dim)."""
         centres = np.array(self.centres, dtype=float)
@@ -219,12 +265,17 @@ class Particles(Table):
             return centres, 0.5 * np.array(self.sizes, dtype=float)
         return centres, np.repeat(np.array(self.radii, dtype=float)[:, None], centres.shape[1], axis=1)
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        """Lower and upper corner of the container of a packing, or of the box around a list: both (dim,)."""
+    def smallest(self) -> float:
+        """The smallest radius or half edge of a list, nm."""
+        return 0.5 * min(map(min, self.sizes)) if self.shape == "box" else min(self.radii)
+
+    def bounds(self) -> Box:
+        """Lower and upper corner of the container of a packing, or of the box around a list."""
         if self.container is not None:
-            return np.array(self.container[0]), np.array(self.container[1])
+            return self.container
         centres, half = self.extents()
-        return (centres - half).min(axis=0), (centres + half).max(axis=0)
+        with np.errstate(over="ignore"):  # huge numbers are refused, not warned of
+            return tuple((centres - half).min(axis=0).tolist()), tuple((centres + half).max(axis=0).tolist())
 
 
 class Model(Table):
@@ -323,6 +374,10 @@ class Output(Table):
     checkpoint_every: Positive = 60.0
     """wall-clock seconds between checkpoints"""
 
+    def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
+        """How often a checkpoint is written changes nothing."""
+        return {key: value for key, value in tree.items() if key != "checkpoint_every"}
+
     def snapshot_times(self, end: float) -> tuple[float, ...]:
         """The times [1] of all snapshots of a run to `end`; round-off does not lose the last of `every`."""
         if not isinstance(self.snapshots, Every):
@@ -379,32 +434,22 @@ class Case(Table):
     @field_validator("output", mode="before")
     @classmethod
     def _fill_in(cls, tree: object, info: ValidationInfo) -> object:
-        """Add the defaults that need other tables; where one of these is refused, any valid value will do."""
+        """Where another table is refused, any valid value will do."""
         if not isinstance(tree, Mapping):
             return tree
         end = info.data["time"].end if "time" in info.data else 1.0
-        box = _inner_box(info.data.get("domain"), info.data.get("particles"))
-        defaults = {"history_every": end / 100, "snapshots": (0.0, end), "vacancy_box": box}
-        return defaults | {key: value for key, value in tree.items() if value is not None}
+        return filled_in(tree, end, info.data.get("domain"), info.data.get("particles"))
 
     @field_validator("particles", "output")
     @classmethod
     def _same_dimension(cls, table: Table, info: ValidationInfo) -> Table:
-        dim = len(info.data["domain"].size) if "domain" in info.data else None
-        _refuse(
-            Problem(f"{field}[{i}]", list(point), f"must be {dim} numbers, as domain.size is")
-            for field in ("centres", "sizes", "container", "vacancy_box")
-            for i, point in enumerate(getattr(table, field, None) or ())
-            if dim is not None and len(point) != dim
-        )
+        if "domain" in info.data:
+            _refuse(wrong_dimensions(table, len(info.data["domain"].size)))
         return table
 
     @model_validator(mode="after")
     def _tables_agree(self) -> Self:
-        listed = (_particles_inside, _particles_apart) if self.particles.source == "list" else ()
-        checks = (*listed, _particles_resolved, _boxes_inside, _times_in_order)
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused, not warned of
-            _refuse(problem for check in checks for problem in check(self))
+        _refuse(disagreements(self))
         return self
 
     def with_particles(self, centres: ArrayLike, radii: ArrayLike) -> "Case":
@@ -414,41 +459,87 @@ class Case(Table):
             "radii": np.asarray(radii, dtype=float).tolist(),
             "interface_width": self.particles.interface_width,
         }
-        return parse_case({**self._tree(), "particles": spheres})
+        return parse_case({**self.tree(), "particles": spheres})
 
-    def _tree(self) -> dict[str, Any]:
-        tree = self.model_dump(mode="json", exclude_none=True)
-        tree["particles"] = {key: value for key, value in tree["particles"].items() if value != []}
-        return tree
+    def tables(self) -> dict[str, Table]:
+        """All that has a table of its own, in the order of the case file."""
+        return {name: value for name, value in vars(self).items() if name != "name"}
+
+    def tree(self) -> dict[str, Any]:
+        """The case as plain values, which need no defaults and no CSV: `parse_case` gives an equal case."""
+        return {"name": self.name} | {name: table.tree() for name, table in self.tables().items()}
 
     def resolved_json(self) -> str:
-        """The case as a JSON case file that needs no defaults and no CSV: `load_case` gives an equal case."""
-        return json.dumps(self._tree(), indent=2, ensure_ascii=False) + "\n"
+        """The tree as a JSON case file."""
+        return json.dumps(self.tree(), indent=2, ensure_ascii=False) + "\n"
 
     def identity(self) -> str:
-        """SHA-256 of all that changes the result; a mesh file counts by its content, wherever it is."""
-        tree = self._tree()
-        del tree["name"], tree["output"]["checkpoint_every"]
-        if self.nodes.path is not None:
-            tree["nodes"]["path"] = hashlib.sha256(Path(self.nodes.path).read_bytes()).hexdigest()
-        return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
+        """SHA-256 of all that changes the result: the essence of every table."""
+        tables = self.tables().items()
+        return fingerprint({name: canonical(table.essence(table.tree())) for name, table in tables})
 
 
-# --- checks across tables
+def canonical(tree: Mapping[str, Any]) -> str:
+    """The one JSON text of a tree."""
+    return CANONICAL.encode(tree)
+
+
+def fingerprint(tables: Mapping[str, str]) -> str:
+    """SHA-256 of a case, from the canonical text of each table."""
+    body = ", ".join([f'"{name}": {tables[name]}' for name in sorted(tables)])
+    return hashlib.sha256(f"{{{body}}}".encode()).hexdigest()
+
+
+# --- across tables
+
+
+def filled_in(
+    output: Mapping[str, Any], end: float, domain: Domain | None, particles: Particles | None
+) -> dict[str, Any]:
+    """The plain table with the defaults that need other tables."""
+    given = {key: value for key, value in output.items() if value is not None}
+    if "vacancy_box" not in given:
+        given["vacancy_box"] = _inner_box(domain, particles)
+    return {"history_every": end / 100, "snapshots": (0.0, end)} | given
+
+
+def wrong_dimensions(table: Table, dim: int) -> Iterator[Problem]:
+    """Points and edges of a table that are not `dim` numbers."""
+    fields = vars(table)
+    for field in ("centres", "sizes", "container", "vacancy_box"):
+        for i, point in enumerate(fields.get(field) or ()):
+            if len(point) != dim:
+                yield Problem(f"{field}[{i}]", list(point), f"must be {dim} numbers, as domain.size is")
+
+
+def disagreements(case: Case, agreed: bool = False) -> Iterator[Problem]:
+    """What is wrong between tables that are right by themselves; `agreed`: particles and domain are known to fit."""
+    if case.particles.source == "list" and not agreed:
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused, not warned of
+            found = [*_particles_inside(case), *_particles_apart(case)]
+        yield from found
+    for check in (_particles_resolved, _boxes_inside, _times_in_order):
+        yield from check(case)
 
 
 def _inner_box(domain: Domain | None, particles: Particles | None) -> Box:
     """The container, or the box around the particles, shrunk to 80 % about its centre, within the domain."""
-    size = np.array(domain.size if domain else (1.0, 1.0))
-    lower, upper = np.zeros_like(size), size
+    size = domain.size if domain else (1.0, 1.0)
+    spans = [(0.0, edge) for edge in size]
     if domain and particles:
-        with np.errstate(over="ignore", invalid="ignore"):
-            lower, upper = particles.bounds()
-            margin = 0.1 * (upper - lower)
-            lower, upper = np.clip(lower + margin, 0.0, size), np.clip(upper - margin, 0.0, size)
-    if not (lower < upper).all():  # the particles are refused themselves: they are the problem, not this box
-        lower, upper = np.zeros_like(size), size
-    return tuple(lower.tolist()), tuple(upper.tolist())
+        spans = [
+            (min(max(low + 0.1 * (high - low), 0.0), edge), min(max(high - 0.1 * (high - low), 0.0), edge))
+            for low, high, edge in zip(*particles.bounds(), size, strict=True)
+        ]
+    if not all(low < high for low, high in spans):  # the particles are refused themselves: they are the problem
+        spans = [(0.0, edge) for edge in size]
+    lower, upper = zip(*spans, strict=True)
+    return lower, upper
+
+
+def _beyond(low: float, high: float, edge: float) -> bool:
+    """Whether a span sticks out of [0, edge] by more than round-off."""
+    return low < -ROUND_OFF * edge or high > edge * (1 + ROUND_OFF)
 
 
 def _outside(lower: Floats, upper: Floats, case: Case) -> Flags:
@@ -482,22 +573,22 @@ def _particles_apart(case: Case) -> Iterator[Problem]:
 def _particles_resolved(case: Case) -> Iterator[Problem]:
     """h <= the smallest radius or half edge; before a packing is drawn only the mean is known."""
     spacing, mean = case.nodes.spacing, case.particles.mean_radius
-    smallest = float(case.particles.extents()[1].min()) if mean is None else mean
+    smallest = case.particles.smallest() if mean is None else mean
     if spacing is not None and spacing > smallest:
         what = "the smallest radius or half edge" if mean is None else "particles.mean_radius"
         yield Problem("nodes.spacing", spacing, f"must be at most {what}, {smallest}")
 
 
 def _boxes_inside(case: Case) -> Iterator[Problem]:
+    size = case.domain.size
     boxes = {"particles.container": case.particles.container, "output.vacancy_box": case.output.vacancy_box}
     for key, box in boxes.items():
         if box is None:
             continue
-        lower, upper = np.array(box)
-        if (lower >= upper).any():
+        if any(map(ge, *box)):
             yield Problem(key, list(box), "must be [lower corner, upper corner], lower along every axis")
-        elif _outside(lower, upper, case):
-            yield Problem(key, list(box), f"must be inside the domain, {list(case.domain.size)}")
+        elif any(map(_beyond, *box, size)):
+            yield Problem(key, list(box), f"must be inside the domain, {list(size)}")
 
 
 def _times_in_order(case: Case) -> Iterator[Problem]:
@@ -522,18 +613,22 @@ def case_schema() -> dict[str, Any]:
 
 def load_case(path: Path | str) -> Case:
     """The case in a TOML or JSON file. Raises `CaseError`."""
+    return parse_case(read_tree(path), base=Path(path).parent)
+
+
+def read_tree(path: Path | str) -> Any:
+    """What a TOML or JSON file holds, as plain values. Raises `CaseError`."""
     path = Path(path)
     readers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": json.loads}
     if path.suffix not in readers:
         raise CaseError([Problem(str(path), None, "must end in .toml or .json")])
     try:
-        tree = readers[path.suffix](path.read_text(encoding="utf-8-sig"))
+        return readers[path.suffix](path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CaseError([Problem(str(path), None, f"cannot be read: {error.strerror}")]) from error
     except (ValueError, RecursionError) as error:
         kind = path.suffix[1:].upper()
         raise CaseError([Problem(str(path), None, f"not valid {kind}: {error}")]) from error
-    return parse_case(tree, base=path.parent)
 
 
 def parse_case(tree: Mapping[str, Any], base: Path | None = None) -> Case:
@@ -541,33 +636,38 @@ def parse_case(tree: Mapping[str, Any], base: Path | None = None) -> Case:
     try:
         return Case.model_validate(tree, context={"base": base})
     except ValidationError as error:
-        raise CaseError(_problems(error)) from None
+        raise CaseError(problems(error, _table)) from None
 
 
 def _absolute(path: str, info: ValidationInfo) -> str:
     return os.path.abspath(((info.context or {}).get("base") or Path()) / path)
 
 
-def _problems(error: ValidationError) -> Iterator[Problem]:
+def problems(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> Iterator[Problem]:
+    """What pydantic refused, in the words of a case file; `table_at` gives the table that holds a key."""
     entries = error.errors(include_url=False)
     inside = {entry["loc"][:-1] for entry in entries}
     for entry in entries:
         loc, kind, cause = entry["loc"], entry["type"], entry.get("ctx", {}).get("error")
         if isinstance(cause, CaseError):
-            yield from (replace(problem, key=_dotted((*loc, problem.key))) for problem in cause.problems)
+            start = f"{_dotted(loc)}." if loc else ""
+            yield from (replace(problem, key=start + problem.key) for problem in cause.problems)
         elif kind == "too_short" and loc in inside:
             continue  # it counts the refused items as lacking
         elif kind == "missing":
-            about = _about(_table(loc), loc[-1]) if isinstance(loc[-1], str) else ""
+            about = _about(table_at(loc), loc[-1]) if isinstance(loc[-1], str) else ""
             yield Problem(_dotted(loc), None, f"must be given{about}")
         else:
-            plain = {"tuple_type": "must be a list", "model_type": "must be a table"}.get(kind)
-            allowed = plain or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
-            yield Problem(_dotted(loc), entry["input"], _known(loc) if kind == "extra_forbidden" else allowed)
+            allowed = PLAIN.get(kind) or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
+            if kind == "extra_forbidden":
+                allowed = _known(str(loc[-1]), table_at(loc))
+            yield Problem(_dotted(loc), entry["input"], allowed)
 
 
 def _dotted(loc: Place) -> str:
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if str(part)[:1] != "|")
+    """The key as TOML writes it: a name that has dots itself is quoted."""
+    names = (f'"{part}"' if "." in str(part) else part for part in loc if str(part)[:1] != "|")
+    parts = (f"[{name}]" if isinstance(name, int) else f".{name}" for name in names)
     return "".join(parts).removeprefix(".") or "case"
 
 
@@ -580,11 +680,25 @@ def _table(loc: Place) -> type[BaseModel]:
     return found
 
 
-def _known(loc: Place) -> str:
-    known = list(_table(loc).model_fields)
-    close = difflib.get_close_matches(str(loc[-1]), known, n=1)
+def _known(name: str, table: type[BaseModel]) -> str:
+    known = list(table.model_fields)
+    close = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"unknown key; allowed here: {', '.join(known)}{hint}"
+
+
+def unknown_part(key: str) -> str | None:
+    """What is allowed in place of the first part of a dotted key that no case has; None: the key exists."""
+    table: type[BaseModel] | None = Case
+    parts = key.split(".")
+    for depth, part in enumerate(parts, start=1):
+        if table is None:
+            return f"{'.'.join(parts[: depth - 1])} has no keys below it"
+        if part not in table.model_fields:
+            return _known(part, table)
+        below = Every if part == "snapshots" else table.model_fields[part].annotation
+        table = below if isinstance(below, type) and issubclass(below, BaseModel) else None
+    return None
 
 
 def _read_csv(path: str, dim: int) -> tuple[tuple[Point, ...], tuple[float, ...]]:

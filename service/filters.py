@@ -1,0 +1,273 @@
+"""From query parameters to SQL: which jobs, in which order, from where on.
+
+A filter is `key=value` or `key.operator=value`. Keys are columns of a job, scalars of its case such as
+`particles.mean_radius`, or of its result such as `result.vacancy_ratio`; keys and types of the case are those of its
+schema. The SQL of a scalar is word for word that of the indices in schema.py, or SQLite would not use them.
+"""
+
+import base64
+import binascii
+import difflib
+import json
+import math
+import operator
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
+from typing import Any
+
+import sqlalchemy as sa
+
+from frit.solver.case import case_schema
+
+from .jobs import Job, State
+from .problems import WrongField, refused
+from .schema import jobs, sweep_jobs
+
+Condition = sa.ColumnElement[bool]
+PAGE = 50  # jobs on a page, unless asked for
+LARGEST_PAGE = 500
+ORDERING = ("lt", "le", "gt", "ge")
+OPERATORS = ("eq", "ne", *ORDERING, "in")
+
+COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
+    name: getattr(operator, name) for name in ("eq", "ne", *ORDERING)
+}  # fmt: skip
+RESERVED = ("state", "sweep", "tag", "order", "limit", "cursor")
+RESULTS = ("time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "particles", "evaluations",
+           "wall_time", "neck_length", "centre_distance")  # fmt: skip
+PACKING = re.compile(r"result\.packing(\.[A-Za-z_][A-Za-z0-9_]*){1,3}")
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """Something to filter or order by; `kind`: number, integer, string, boolean, time."""
+
+    key: str
+    kind: str
+    sql: sa.ColumnElement[Any]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What a list of jobs is made of."""
+
+    where: Condition
+    order: tuple[sa.ColumnElement[Any], ...]
+    limit: int
+    by: str
+    scalar: Scalar | None
+    """what is ordered by before the order of submission"""
+
+    @property
+    def descending(self) -> bool:
+        """Whether the largest comes first."""
+        return self.by.startswith("-")
+
+
+class WrongQueryError(ValueError):
+    """A query parameter that cannot be."""
+
+    def __init__(self, parameter: str, value: Any, allowed: str) -> None:
+        self.field = WrongField(parameter=parameter, value=value, detail=allowed)
+        super().__init__(allowed)
+
+
+# --- keys -------------------------------------------------------------------------------------------------
+
+
+@cache
+def columns() -> dict[str, Scalar]:
+    """Columns of a job."""
+    kinds = {
+        "id": "string", "name": "string", "identity": "string", "state": "string", "priority": "integer",
+        "ranks": "integer", "attempt": "integer", "created": "time", "started": "time", "ended": "time",
+        "core_seconds": "number",
+    }  # fmt: skip
+    return {key: Scalar(key, kind, jobs.c[key]) for key, kind in kinds.items()}
+
+
+@cache
+def case_keys() -> dict[str, Scalar]:
+    """Scalars of the case, by dotted key."""
+    schema = case_schema()
+    return {key: _scalar("case", key, kind) for key, kind in _scalars(schema, schema, "") if key != "name"}
+
+
+def _scalars(node: Mapping[str, Any], schema: Mapping[str, Any], key: str) -> Iterator[tuple[str, str]]:
+    if "$ref" in node:
+        node = schema["$defs"][node["$ref"].rpartition("/")[2]]
+    for form in (*node.get("anyOf", ()), *node.get("oneOf", ())):
+        yield from _scalars(form, schema, key)
+    for name, child in node.get("properties", {}).items():
+        yield from _scalars(child, schema, f"{key}.{name}" if key else name)
+    if (kind := node.get("type")) in ("number", "integer", "string", "boolean"):
+        yield key, kind
+
+
+def _scalar(column: str, key: str, kind: str) -> Scalar:
+    prefix = "result." if column == "result" else ""
+    quoted = '"case"' if column == "case" else column
+    return Scalar(prefix + key, kind, sa.literal_column(f"json_extract({quoted}, '$.{key}')"))
+
+
+@cache
+def result_keys() -> dict[str, Scalar]:
+    """Scalars of the last history row; those of a packing are whatever `run.json` has."""
+    return {f"result.{key}": _scalar("result", key, "number") for key in RESULTS}
+
+
+def known() -> dict[str, Scalar]:
+    """All that can be named, but for the results of packings."""
+    return {**columns(), **case_keys(), **result_keys()}
+
+
+def find(key: str, parameter: str) -> Scalar:
+    """The scalar of a key. Raises `WrongQueryError` with the nearest key there is."""
+    if PACKING.fullmatch(key):
+        return _scalar("result", key.removeprefix("result."), "number")
+    if (found := known().get(key)) is None:
+        names = [*known(), "sweep", "tag"]
+        close = difflib.get_close_matches(key, names, n=1) or [n for n in names if n.rpartition(".")[2] == key][:1]
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        allowed = f"unknown key {key!r}: a job's columns, scalars of its case and result.* are known{hint}"
+        raise WrongQueryError(parameter, None, allowed)
+    return found
+
+
+# --- conditions -------------------------------------------------------------------------------------------
+
+
+def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -> Selection:
+    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpError`."""
+    wrong: list[WrongField] = []
+    where: list[Condition] = []
+    given: dict[str, list[str]] = {}
+    for name, value in parameters:
+        given.setdefault(name, []).append(value)
+    for name, values in given.items():
+        try:
+            if name not in ("order", "limit", "cursor"):
+                where.extend(_conditions(name, values, sweep))
+        except WrongQueryError as error:
+            wrong.append(error.field)
+    by, limit, scalar = "-created", PAGE, None
+    try:
+        by = given.get("order", ["-created"])[-1]
+        scalar = _order(by)
+        limit = _limit(given.get("limit", [str(PAGE)])[-1])
+        if "cursor" in given:
+            where.append(_after(given["cursor"][-1], by, scalar))
+    except WrongQueryError as error:
+        wrong.append(error.field)
+    if wrong:
+        raise refused("refused-query", "The query is refused", wrong)
+    direction = sa.desc if by.startswith("-") else sa.asc
+    first = () if scalar is None else (direction(scalar.sql),)
+    return Selection(sa.and_(sa.true(), *where), (*first, direction(jobs.c.seq)), limit, by, scalar)
+
+
+def _conditions(name: str, values: list[str], sweep: Callable[[str], int]) -> Iterator[Condition]:
+    if name == "state":
+        states = [state for value in values for state in value.split(",")]
+        if unknown := [state for state in states if state not in list(State)]:
+            raise WrongQueryError(name, unknown[0], f"must be one of {', '.join(State)}")
+        yield jobs.c.state == states[0] if len(states) == 1 else jobs.c.state.in_(states)
+    elif name == "sweep":
+        for value in values:
+            yield jobs.c.seq.in_(sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep(value)))
+    elif name == "tag":
+        for value in values:
+            each = sa.func.json_each(jobs.c.tags).table_valued("value")
+            yield sa.exists(sa.select(sa.literal(1)).select_from(each).where(each.c.value == value))
+    else:
+        key, dot, verb = name.rpartition(".")
+        if not dot or verb not in OPERATORS or name in known():
+            key, verb = name, "eq"
+        scalar = find(key, name)
+        for value in values:
+            yield _condition(scalar, verb, value, name)
+
+
+def _condition(scalar: Scalar, verb: str, text: str, parameter: str) -> Condition:
+    if verb in ORDERING and scalar.kind in ("string", "boolean"):
+        raise WrongQueryError(parameter, text, f"{scalar.key} is a {scalar.kind}: only eq, ne and in are possible")
+    if verb == "in":
+        return scalar.sql.in_([_typed(scalar, part, parameter) for part in text.split(",")])
+    value = _typed(scalar, text, parameter)
+    return sa.type_coerce(COMPARE[verb](scalar.sql, sa.bindparam(None, value)), sa.Boolean)
+
+
+def _typed(scalar: Scalar, text: str, parameter: str) -> str | float | int:
+    """The value as its column or the schema has it. Whole numbers beyond 64 bits are compared as floats."""
+    if scalar.kind == "string":
+        return text
+    if scalar.kind == "boolean":
+        if text not in ("true", "false"):
+            raise WrongQueryError(parameter, text, "must be true or false")
+        return int(text == "true")
+    try:
+        if scalar.kind == "integer" and re.fullmatch(r"[+-]?[0-9]{1,18}", text):
+            return int(text)
+        number = float(text)
+    except ValueError:
+        number = _seconds(text) if scalar.kind == "time" else math.nan
+    if not math.isfinite(number):
+        word = "a time, ISO 8601 or seconds since 1970" if scalar.kind == "time" else "a finite number"
+        raise WrongQueryError(parameter, text, f"must be {word}")
+    return number
+
+
+def _seconds(text: str) -> float:
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return math.nan
+
+
+# --- order and place --------------------------------------------------------------------------------------
+
+
+def _order(by: str) -> Scalar | None:
+    """The scalar to order by; None for the order of submission, which `created` is."""
+    key = by.removeprefix("-")
+    return None if key == "created" else find(key, "order")
+
+
+def _limit(text: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,9}", text) or not 1 <= int(text) <= LARGEST_PAGE:
+        raise WrongQueryError("limit", text, f"must be a whole number from 1 to {LARGEST_PAGE}")
+    return int(text)
+
+
+def cursor(selection: Selection, last: Job, value: Any) -> str:
+    """Where the next page begins: after this job, whose value in the order is given."""
+    place = json.dumps([selection.by, last.seq, value], separators=(",", ":"))
+    return base64.urlsafe_b64encode(place.encode()).decode().rstrip("=")
+
+
+def _after(text: str, by: str, scalar: Scalar | None) -> Condition:
+    """Jobs that come after the cursor's. NULL is the smallest value, as SQLite orders it."""
+    try:
+        place = json.loads(base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True))
+        ordered, seq, value = place
+        good = ordered == by and type(seq) is int and abs(seq) < 2**63 and isinstance(value, str | int | float | None)
+    except (binascii.Error, ValueError, TypeError, RecursionError):
+        good = False
+    if not good:
+        raise WrongQueryError("cursor", text, f"must come from the page before, with the same order ({by})")
+    descending = by.startswith("-")
+    later: Condition = jobs.c.seq < seq if descending else jobs.c.seq > seq
+    if scalar is None:
+        return later
+    e = scalar.sql
+    if value is None:
+        tied: Condition = e.is_(None) & later
+        return tied if descending else tied | e.is_not(None)
+    wide = isinstance(value, int) and abs(value) >= 2**63
+    bound: sa.BindParameter[Any] = sa.bindparam(None, float(value) if wide else value)
+    tied = (e == bound) & later
+    after: Condition = (e < bound) | e.is_(None) | tied if descending else (e > bound) | tied
+    return after

@@ -1,0 +1,51 @@
+"""What Prometheus reads: requests, as the instrumentator counts them, and jobs by state."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from fastapi import FastAPI
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+from prometheus_fastapi_instrumentator import Instrumentator
+
+from .engine import Engine
+from .store import StoreError
+
+
+class Jobs(Collector):
+    """Gauges that are read from the index when they are asked for."""
+
+    def __init__(self, engine: Callable[[], Engine]) -> None:
+        self.engine = engine
+
+    def describe(self) -> list[GaugeMetricFamily]:
+        """Nothing to be read at registration."""
+        return []
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        """Read now."""
+        engine = self.engine()
+        try:
+            counts = engine.store.counts()
+        except StoreError:
+            counts = {}
+        jobs = GaugeMetricFamily("frit_jobs", "Jobs in the index, by state.", labels=["state"])
+        for state, number in counts.items():
+            jobs.add_metric([state], number)
+        yield jobs
+        ready = GaugeMetricFamily("frit_ready", "1 where jobs can be started and recorded.")
+        ready.add_metric([], float(engine.trouble() is None))
+        yield ready
+        cores = GaugeMetricFamily("frit_cores", "Processors given to jobs.")
+        cores.add_metric([], engine.settings.cores)
+        yield cores
+
+
+def expose(app: FastAPI, engine: Callable[[], Engine], **route: Any) -> None:
+    """Count requests, and answer GET /metrics."""
+    registry = CollectorRegistry()
+    registry.register(Jobs(engine))
+    Instrumentator(registry=registry, excluded_handlers=["/metrics", "/livez", "/readyz"]).instrument(app).expose(
+        app, include_in_schema=True, **route
+    )

@@ -1,0 +1,182 @@
+"""Errors over HTTP: RFC 9457 problem details with a JSON pointer to each wrong field of the request."""
+
+import http
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from frit.solver.case import CaseError
+
+from .jobs import TransitionError
+from .store import KeyReusedError, NotFoundError, StoreError
+
+MEDIA_TYPE = "application/problem+json"
+RETRY_AFTER = 5  # seconds
+SHOWN = 200  # characters of a refused value
+PART = re.compile(r'"([^"]*)"|\[(\d+)\]|([^.\[\]"]+)')
+
+
+class WrongField(BaseModel):
+    """One wrong field. `pointer` leads into the request's body (RFC 6901); `parameter` names one outside of it."""
+
+    pointer: str | None = None
+    parameter: str | None = None
+    value: Any = None
+    detail: str
+
+
+class ProblemDetails(BaseModel):
+    """An error. `type` tells errors apart; `errors` has an entry per wrong field of the request."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "/problems/refused-case",
+                    "title": "The case is refused",
+                    "status": 422,
+                    "detail": "particles.radii[0] = -1.0: must be greater than 0",
+                    "errors": [
+                        {"pointer": "/case/particles/radii/0", "value": -1.0, "detail": "must be greater than 0"}
+                    ],
+                }
+            ]
+        }
+    )
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    errors: list[WrongField] = []
+    state: str | None = None
+
+
+class HttpError(Exception):
+    """An error on its way to the client."""
+
+    def __init__(
+        self, status: int, kind: str, title: str, detail: str,
+        errors: Iterable[WrongField] = (), headers: Mapping[str, str] | None = None, state: str | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(detail)
+        self.details = ProblemDetails(
+            type=f"/problems/{kind}", title=title, status=status, detail=detail, errors=list(errors), state=state
+        )
+        self.headers = dict(headers or {})
+
+    def response(self) -> Response:
+        """As it is sent: ASCII, so that no text of a request can break it."""
+        tree = self.details.model_dump(exclude_none=True)
+        if not tree["errors"]:
+            del tree["errors"]
+        return Response(json.dumps(tree), self.details.status, self.headers, MEDIA_TYPE)
+
+
+def refused(kind: str, title: str, fields: Sequence[WrongField], status: int = 422) -> HttpError:
+    """A request with wrong fields."""
+    places = (f"{field.parameter or field.pointer or 'body'}: {field.detail}" for field in fields)
+    return HttpError(status, kind, title, "; ".join(places), fields)
+
+
+def refused_case(error: CaseError, pointer: str, title: str = "The case is refused") -> HttpError:
+    """A case or sweep at `pointer` in the body that says what is wrong with it."""
+    kind = "refused-case" if pointer == "/case" else "refused-sweep"
+    fields = [
+        WrongField(pointer=pointer + pointer_to(problem.key), value=shown(problem.value), detail=problem.allowed)
+        for problem in error.problems
+    ]
+    return HttpError(422, kind, title, str(error), fields)
+
+
+def unavailable(detail: str) -> HttpError:
+    """The service cannot do it now; trying again later is right."""
+    title = "The service cannot do this now"
+    return HttpError(503, "unavailable", title, detail, headers={"Retry-After": str(RETRY_AFTER)})
+
+
+def not_found(detail: str) -> HttpError:
+    """There is no such thing."""
+    return HttpError(404, "not-found", "There is no such thing", detail)
+
+
+def pointer_to(key: str) -> str:
+    """The JSON pointer of a dotted key such as `particles.radii[0]` or `axes."particles.mean_radius"`; `case`: all."""
+    if key == "case":
+        return ""
+    parts = ["".join(found) for found in PART.findall(key)]
+    return "".join(f"/{escaped(part)}" for part in parts)
+
+
+def escaped(part: str) -> str:
+    """A part of a JSON pointer."""
+    return part.replace("~", "~0").replace("/", "~1")
+
+
+def shown(value: Any) -> Any:
+    """A refused value as it may be sent: short, and without numbers that JSON does not know."""
+    if value is None or isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    try:
+        text = value if isinstance(value, str) else json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        text = repr(value)
+    if len(text) > SHOWN:
+        return text[: SHOWN - 3] + "..."
+    return value if isinstance(value, list | tuple | dict) and text[:1] in "[{" else text
+
+
+def handle_problems(app: FastAPI) -> None:
+    """Have every error of the app answered as a problem."""
+
+    async def problem(_: Request, error: Exception) -> Response:
+        return as_problem(error).response()
+
+    kinds = (HttpError, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError)
+    for kind in (*kinds, TransitionError, Exception):
+        app.add_exception_handler(kind, problem)
+
+
+def as_problem(error: Exception) -> HttpError:
+    """What the client is told of an error; nothing of one that was not foreseen."""
+    if isinstance(error, HttpError):
+        return error
+    if isinstance(error, RequestValidationError):
+        return refused("refused-request", "The request is refused", [_wrong(entry) for entry in error.errors()])
+    if isinstance(error, StoreError):
+        return unavailable("the index cannot be used now")
+    if isinstance(error, NotFoundError):
+        return not_found(str(error))
+    if isinstance(error, KeyReusedError):
+        field = WrongField(parameter="Idempotency-Key", detail=str(error))
+        return HttpError(422, "key-reused", "The key came before, with another request", str(error), [field])
+    if isinstance(error, TransitionError):
+        title = "The job's state does not allow this"
+        return HttpError(409, "wrong-state", title, str(error), state=str(error.state))
+    if isinstance(error, HTTPException):
+        if error.status_code == 413:
+            return HttpError(413, "content-too-large", "The body is too large", error.detail)
+        title = http.HTTPStatus(error.status_code).phrase
+        kind = title.lower().replace(" ", "-").replace("'", "")
+        return HttpError(error.status_code, kind, title, str(error.detail), headers=error.headers)
+    return HttpError(500, "internal-error", "The service broke", "an error that was not foreseen; it is in the log")
+
+
+def _wrong(entry: Mapping[str, Any]) -> WrongField:
+    """Of pydantic's errors: the first part of the place says where the value came from."""
+    where, *parts = entry["loc"]
+    if entry["type"] == "json_invalid":
+        return WrongField(pointer="", detail=f"not valid JSON at character {parts[0]}: {entry['ctx']['error']}")
+    value = None if entry["type"] == "missing" else shown(entry["input"])
+    if where == "body":
+        pointer = "".join(f"/{escaped(str(part))}" for part in parts)
+        return WrongField(pointer=pointer, value=value, detail=entry["msg"])
+    return WrongField(parameter=".".join(map(str, parts)), value=value, detail=entry["msg"])

@@ -1,0 +1,218 @@
+"""A sweep of small real runs, while service, runners, mpiruns and ranks are killed at random moments."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from frit.service.files import read_json, start_of
+from frit.service.jobs import Job, NewJob, State
+from frit.service.store import Store
+from frit.solver.case import parse_case
+
+VICTIMS = ("service", "runner", "mpirun", "rank")
+
+# The engine alone, as `frit serve` and `frit sweep run` have it inside; killed and started again by the soak.
+SERVICE = """
+import asyncio, sys
+from frit.service.engine import Engine
+from frit.service.settings import Settings
+
+async def main():
+    async with Engine(Settings(data=sys.argv[1], cores=2, attempts=1000, backoff=0.05, backoff_limit=0.2, poll=0.2)):
+        await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
+
+def new_jobs(count: int, steps: int, ranks: int = 1) -> list[NewJob]:
+    """Different pairs of discs; a checkpoint whenever a fifth of a second has passed."""
+    made = []
+    for k in range(count):
+        case = parse_case(
+            {
+                "name": f"pair {k}",
+                "domain": {"size": [22.0, 13.0]},
+                "nodes": {"spacing": 1.0},
+                "particles": {"centres": [[6.5, 6.2], [15.4 + 0.01 * k, 6.8]], "radii": [5.0, 4.0]},
+                "time": {"integrator": "rk2", "end": steps * 1e-4, "step": 1e-4},
+                "output": {
+                    "history_every": steps * 2e-6,
+                    "snapshots": [0.0, steps * 1e-4],
+                    "checkpoint_every": 0.2,
+                },
+            }
+        )
+        made.append(NewJob(json.dumps(json.loads(case.resolved_json())), case.identity(), case.name, ranks))
+    return made
+
+
+def submit(data: Path, jobs: list[NewJob]) -> None:
+    """Queue the jobs while no service runs."""
+    data.mkdir(parents=True, exist_ok=True)
+    store = Store(data)
+    for answer in [store.submit(job) for job in jobs]:
+        answer.result()
+    store.close()
+
+
+class Service:
+    """The service as a process that may be killed."""
+
+    def __init__(self, data: Path) -> None:
+        self.data = data
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it, or start it again."""
+        with open(self.data / "service.log", "ab") as log:
+            command = [sys.executable, "-P", "-W", "error", "-c", SERVICE, str(self.data)]
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+
+    def kill(self) -> None:
+        """kill -9."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+
+@contextmanager
+def service(data: Path) -> Iterator[Service]:
+    """A service for the length of a block; what is left of it, and of its jobs, is killed."""
+    running = Service(data)
+    running.start()
+    try:
+        yield running
+    finally:
+        running.kill()
+        for process in of_data(data):
+            with suppress(psutil.Error):
+                process.kill()
+
+
+def of_data(data: Path) -> list[psutil.Process]:
+    """All processes of runs in this data folder: mpirun and everything below it, wherever it hangs."""
+    found, mark = [], f"FRIT_RUN={data.absolute()}/"
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if mark in Path(f"/proc/{process.pid}/environ").read_text(errors="replace"):
+                found.append(process)
+    return found
+
+
+def runners(data: Path) -> list[int]:
+    """Pids of living runners."""
+    records = [read_json(path) for path in data.glob("runs/*/attempt.json")]
+    return [record["pid"] for record in records if start_of(record["pid"]) == record["pid_start"]]
+
+
+def kill_one(kind: str, running: Service, random_: random.Random) -> bool:
+    """Kill a victim of this kind; False where there is none at the moment."""
+    if kind == "service":
+        if running.process is None:
+            return False
+        running.kill()
+        return True
+    if kind == "runner":
+        pids = runners(running.data)
+    else:
+        words = {"mpirun": "mpirun", "rank": "frit.solver"}
+        pids = []
+        for process in of_data(running.data):
+            with suppress(psutil.Error):
+                line = process.cmdline()
+                first = Path(line[0]).name if line else ""
+                is_rank = "frit.solver" in line and first.startswith("python")
+                if (kind == "rank" and is_rank) or (kind == "mpirun" and first.startswith(words["mpirun"])):
+                    pids.append(process.pid)
+    if not pids:
+        return False
+    with suppress(ProcessLookupError):
+        os.kill(random_.choice(pids), signal.SIGKILL)
+        return True
+    return False
+
+
+def disturb(running: Service, kills: int, pause: float, seed: int) -> Counter[str]:
+    """Kill until `kills` have been killed or all jobs are done; a killed service is started again after a while."""
+    random_, counts = random.Random(seed), Counter[str]()
+    while sum(counts.values()) < kills and not all_done(running.data):
+        time.sleep(random_.uniform(0.0, 2.0 * pause))
+        kind = random_.choice(VICTIMS)
+        if kill_one(kind, running, random_):
+            counts[kind] += 1
+            if kind == "service":
+                time.sleep(random_.uniform(0.0, pause))
+                running.start()
+    return counts
+
+
+def jobs_of(data: Path) -> list[Job]:
+    """All jobs, first to last, seen from outside while the service may be writing."""
+    store = Store(data)
+    try:
+        return store.jobs(limit=100_000)[::-1]
+    finally:
+        store.close()
+
+
+def all_done(data: Path) -> bool:
+    """Whether every job is final."""
+    return all(job.final for job in jobs_of(data))
+
+
+def wait(data: Path, seconds: float) -> None:
+    """Until all jobs are final. Raises TimeoutError: that is a hang."""
+    deadline = time.monotonic() + seconds
+    while not all_done(data):
+        if time.monotonic() > deadline:
+            states = Counter(job.state for job in jobs_of(data))
+            raise TimeoutError(f"{dict(states)} after {seconds} s; {(data / 'service.log').read_text()[-2000:]}")
+        time.sleep(0.2)
+
+
+def successes(data: Path) -> dict[str, int]:
+    """How often each job has come to `succeeded`."""
+    store = Store(data)
+    try:
+        names = [job.id for job in store.jobs(limit=100_000)]
+        return {name: sum(event.state is State.SUCCEEDED for event in store.events(name)) for name in names}
+    finally:
+        store.close()
+
+
+def histories(data: Path) -> dict[str, list[dict[str, Any]]]:
+    """By the job's name, from the index, which must say what the file says; without the wall time."""
+    store = Store(data)
+    found = {}
+    try:
+        for job in store.jobs(limit=100_000):
+            rows = [json.loads(line) for _, line in store.history(job.id)]
+            lines = (data / "runs" / job.id / "history.jsonl").read_text().splitlines()
+            assert rows == [json.loads(line) for line in lines]
+            found[job.name] = [{key: value for key, value in row.items() if key != "wall_time"} for row in rows]
+    finally:
+        store.close()
+    return found
+
+
+def run_undisturbed(data: Path, jobs: list[NewJob], seconds: float) -> None:
+    """The same jobs, left alone."""
+    submit(data, jobs)
+    with service(data):
+        wait(data, seconds)
+
+
+

@@ -15,17 +15,21 @@ from frit.service.jobs import Job, NewJob
 from frit.service.settings import Settings
 from frit.solver.case import parse_case
 
-TIMEOUT = 240.0  # seconds; for hangs
+TIMEOUT = 60.0  # seconds; for hangs
 
-# mpirun's place: waits while the file `hold` is beside the script, then says that the run is done.
+# mpirun's place: waits while the file `hold` is beside the script, then says that the run is done; ends without a word,
+# once, where the file `break` is beside it.
 STAND_IN = """#!/bin/sh
 [ "$1" = --version ] && exit
 for word; do
     case "$before" in --out|--resume) directory=$word ;; esac
     before=$word
 done
+here=$(dirname "$0")
 echo started >> "$directory/started.txt"
-while [ -e "$(dirname "$0")/hold" ]; do sleep 0.02; done
+basename "$directory" >> "$here/order.txt"
+rm "$here/break" 2> /dev/null && exit 1
+while [ -e "$here/hold" ]; do sleep 0.02; done
 echo '{"state": "done"}' > "$directory/run.json.new" && mv "$directory/run.json.new" "$directory/run.json"
 """
 

@@ -15,7 +15,7 @@ from frit.service.jobs import Job, NewJob
 from frit.service.settings import Settings
 from frit.solver.case import parse_case
 
-TIMEOUT = 60.0  # seconds; for hangs
+TIMEOUT = 120.0  # seconds; for hangs
 
 # mpirun's place: waits while the file `hold` is beside the script, then says that the run is done; ends without a word,
 # once, where the file `break` is beside it.

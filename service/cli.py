@@ -19,7 +19,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from . import commands_server, commands_sweep, commands_token
+from . import commands_index, commands_server, commands_sweep, commands_token
 from .launch import Launch, LaunchError, Outcome, read_record
 from .words import AsJson, cell, in_words, refuse
 
@@ -33,6 +33,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(commands_index.db, name="db")
+app.command()(commands_index.reindex)
 app.add_typer(commands_sweep.app, name="sweep")
 app.add_typer(commands_token.app, name="token")
 

@@ -102,7 +102,7 @@ def check(settings: Settings) -> None:
             check_address(settings, store)
         finally:
             store.close()
-    except IndexVersionError as error:
+    except (IndexVersionError, StoreError) as error:
         raise EngineError(str(error)) from error
     finally:
         os.close(lock)
@@ -114,8 +114,7 @@ def take(data: Path) -> int:
         (data / "runs").mkdir(parents=True, exist_ok=True)
         lock = try_lock(data / "lock")
         if lock is not None:
-            os.ftruncate(lock, 0)
-            os.write(lock, f"{os.getpid()}\n".encode())
+            sign(lock)
     except OSError as error:
         reasons = {errno.EROFS: "it is read-only", errno.EACCES: "this user may not write there"}
         reason = reasons.get(error.errno or 0, error.strerror)
@@ -124,3 +123,13 @@ def take(data: Path) -> int:
         owner = (data / "lock").read_text().strip()
         raise EngineError(f"data = {data}: in use by process {owner}: one service per data folder")
     return lock
+
+
+def sign(lock: int) -> None:
+    """Write into the lock who holds it; where that fails, it is let go."""
+    try:
+        os.ftruncate(lock, 0)
+        os.write(lock, f"{os.getpid()}\n".encode())
+    except OSError:
+        os.close(lock)
+        raise

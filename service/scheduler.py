@@ -85,6 +85,9 @@ class Scheduler:
                 self.trouble = self._disk()
             except (StoreError, OSError) as error:
                 self._complain(str(error))
+            except Exception as error:  # not foreseen: the next tick may go better, and all running jobs depend on it
+                logger.exception("a tick has failed")
+                self.trouble = f"{type(error).__name__}: {error}"
             await self.hub.wait(TICK)
 
     async def tick(self) -> None:
@@ -116,7 +119,11 @@ class Scheduler:
         """Tell a job's runner to checkpoint and end; `reason` is one of runner.STOPS."""
         directory = self.settings.runs / job.id
         request = {"attempt": job.attempt, "stop": reason}
-        await asyncio.to_thread(write_json, directory / "request.json", request)
+        try:
+            await asyncio.to_thread(directory.mkdir, parents=True, exist_ok=True)  # its runner may be on the way up
+            await asyncio.to_thread(write_json, directory / "request.json", request)
+        except OSError as error:  # a full disk: it is released then, and the index knows what else was wanted
+            self._complain(f"job {job.id}: {error}")
         self.backend.tell(directory, job.attempt, signal.SIGTERM)
 
     async def release(self) -> None:
@@ -195,11 +202,12 @@ class Scheduler:
             try:
                 await self.follower.finish(job)
                 break
-            except (StoreError, OSError, ValueError) as error:
+            except (StoreError, OSError) as error:
                 self._complain(f"job {job.id}: {error}")
-                if isinstance(error, ValueError):  # a damaged file: the job has ended all the same
-                    break
                 await asyncio.sleep(AGAIN)
+            except Exception as error:  # a damaged file: the job has ended all the same
+                logger.warning("job %s: %s: %s", job.id, type(error).__name__, error)
+                break
         ended = await self._insist(lambda: self.store.finish(job.id, end, self.settings.attempts))
         self.running.pop(job.id, None)
         self.free |= cores
@@ -272,5 +280,6 @@ def make_directory(directory: Path, job: Job) -> None:
         beside = submitted.with_name("submitted.json.new")
         beside.write_text(job.case)
         os.replace(beside, submitted)
-    record = {key: getattr(job, key) for key in ("id", "name", "ranks", "priority", "tags", "time_limit", "created")}
+    keys = ("seq", "id", "identity", "name", "ranks", "priority", "tags", "time_limit", "created")
+    record = {key: getattr(job, key) for key in keys}
     write_json(directory / "job.json", record, durable=False)

@@ -4,8 +4,6 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-
-from frit.service.jobs import State
 from soak import (
     disturb,
     histories,
@@ -19,6 +17,8 @@ from soak import (
     successes,
     wait,
 )
+
+from frit.service.jobs import State
 
 
 def soak(folder: Path, count: int, kills: int, steps: int, pause: float) -> Counter[str]:

@@ -171,8 +171,9 @@ class Particles(Table):
         ("list", "sphere"): {"centres": ..., "radii": ...},
         ("list", "box"): {"centres": ..., "sizes": ...},
         ("file", "sphere"): {"path": ...},
-        ("packing", "sphere"): {"mean_radius": ..., "std_radius": 0.0, "seed": 0, "container": ...}
-        | {"packing_density": None, "count": None},
+        ("packing", "sphere"): {"method": ..., "distribution": "normal", "mean_radius": None, "std_radius": None}
+        | {"truncation": None, "histogram": (), "packing_density": None, "count": None, "seed": 0, "container": ...}
+        | {"friction": 0.0, "exchange": False},
     }
 
     source: Literal["list", "file", "packing"] = "list"
@@ -187,18 +188,34 @@ class Particles(Table):
     """edge lengths, nm: one set per particle (list of boxes)"""
     path: Text | None = None
     """CSV of x,y[,z],radius, nm; relative to the case file (file)"""
+    method: Literal["pour", "density"] | None = None
+    """pour: gravity fills the container, along the last axis; density: a lid presses the particles in the container
+    to a solid fraction (packing; default: density where packing_density is given, pour where count is)"""
+    distribution: Literal["normal", "lognormal", "histogram"] | None = None
+    """of the radii (packing; default normal)"""
     mean_radius: Positive | None = None
     """mean of the radii, nm (packing)"""
     std_radius: NonNegative | None = None
     """standard deviation of the radii, nm (packing; default 0)"""
+    truncation: Annotated[float, FINITE, Field(gt=0, le=6)] | None = None
+    """radii are drawn within this many standard deviations of the mean [1], and not below a fifth of it; for
+    lognormal: of the logarithm (packing; default 3)"""
+    histogram: tuple[tuple[Positive, Positive], ...] = ()
+    """pairs of radius, nm, and weight [1], instead of mean_radius and std_radius (packing, histogram)"""
     packing_density: Fraction | None = None
-    """solid fraction of the container [1] (packing; this or count)"""
+    """solid fraction [1], within 0.005, of output.vacancy_box, or of the container where that box is not inside it
+    or particles are poured (packing; this or count)"""
     count: Annotated[int, Field(strict=True, ge=1)] | None = None
     """number of particles (packing; this or packing_density)"""
     seed: Annotated[int, Field(strict=True, ge=0)] | None = None
     """seed of the random draw (packing; default 0)"""
     container: Box | None = None
     """lower and upper corner of the packed box, nm (packing)"""
+    friction: NonNegative | None = None
+    """Coulomb's coefficient between particles [1]; walls are smooth (packing, pour; default 0)"""
+    exchange: Flag | None = None
+    """let shaken particles exchange radii: denser than random close packing where radii differ (packing, density;
+    default false)"""
     interface_width: Positive = 1.0
     """xi, nm: eta(a) = (1 - tanh((d_a - R_a) / xi)) / 2 at t = 0, eq. (34)"""
 
@@ -208,9 +225,19 @@ class Particles(Table):
         given, n = getattr(self, name), len(self.centres)
         if self.source == "list" and len(given) != n:
             raise CaseError([Problem(name, list(given), f"must be {n}, one per centre, not {len(given)}")])
-        if self.source == "packing" and (self.count is None) == (self.packing_density is None):
-            raise CaseError([Problem("packing_density", self.packing_density, "give either this or count")])
+        if self.source == "packing":
+            _refuse(_packing_problems(self))
         return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose(cls, tree: object) -> object:
+        """Defaults of a packing that depend on what else was given."""
+        if not isinstance(tree, Mapping) or tree.get("source") != "packing":
+            return tree
+        given = {key: value for key, value in tree.items() if value is not None}
+        drawn = {} if given.get("distribution") == "histogram" else {"std_radius": 0.0, "truncation": 3.0}
+        return {"method": "pour" if "count" in given else "density"} | drawn | given
 
     def extents(self) -> tuple[Floats, Floats]:
         """Centres, and half widths along the axes, of a list: both (particles, dim)."""
@@ -434,6 +461,27 @@ class Case(Table):
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
 
 
+def _packing_problems(given: Particles) -> Iterator[Problem]:
+    if (given.count is None) == (given.packing_density is None):
+        yield Problem("packing_density", given.packing_density, "give either this or count")
+    drawn = ("mean_radius", "std_radius", "truncation")
+    if given.distribution != "histogram":
+        if given.mean_radius is None:
+            yield Problem("mean_radius", None, f"must be given with source = 'packing'{_about(Particles, 'mean_radius')}")
+        if given.histogram:
+            yield Problem("histogram", given.histogram, "belongs to distribution = 'histogram'")
+    else:
+        if not given.histogram:
+            yield Problem("histogram", None, f"must be given{_about(Particles, 'histogram')}")
+        for name in drawn:
+            if (value := getattr(given, name)) is not None:
+                yield Problem(name, value, "does not belong to distribution = 'histogram'")
+    if given.method == "pour" and given.exchange:
+        yield Problem("exchange", True, "must be false with method = 'pour'")
+    if given.method == "density" and given.friction:
+        yield Problem("friction", given.friction, "must be 0 with method = 'density', which presses without friction")
+
+
 # --- checks across tables
 
 
@@ -481,10 +529,12 @@ def _particles_apart(case: Case) -> Iterator[Problem]:
 
 def _particles_resolved(case: Case) -> Iterator[Problem]:
     """h <= the smallest radius or half edge; before a packing is drawn only the mean is known."""
-    spacing, mean = case.nodes.spacing, case.particles.mean_radius
-    smallest = float(case.particles.extents()[1].min()) if mean is None else mean
+    spacing, given = case.nodes.spacing, case.particles
+    if given.source == "packing":
+        smallest, what = given.mean_radius or min(radius for radius, _ in given.histogram), "particles.mean_radius"
+    else:
+        smallest, what = float(given.extents()[1].min()), "the smallest radius or half edge"
     if spacing is not None and spacing > smallest:
-        what = "the smallest radius or half edge" if mean is None else "particles.mean_radius"
         yield Problem("nodes.spacing", spacing, f"must be at most {what}, {smallest}")
 
 

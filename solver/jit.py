@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 COMPILED = (
-    "simd.py", "energy.py", "kernels.py", "shape.py", "clip.py", "slots.py", "jit.py",
+    "simd.py", "energy.py", "kernels.py", "shape.py", "clip.py", "slots.py", "dem.py", "jit.py",
 )
 
 # Reassociation, contraction and reciprocals, but NaN and infinity keep their meaning: a bad state must be seen.

@@ -1,0 +1,271 @@
+"""Packings: particles poured into a container, or pressed in it to a density. Lengths are in nm.
+
+Both begin with *cohesive settling*: particles fall one by one at random places and stay where they first touch, which
+makes a connected, very loose pile (solid fraction near 0.15 in 3-D, 0.36 in 2-D).
+
+pour     Gravity pulls the pile down, with damping and friction, until it is at rest; the container is open above.
+density  A lid presses the pile down to the height of the container, slowly and without friction; then weak cohesion
+         draws neighbours together, and clusters that still float are moved until they touch. How many particles that
+         takes is found by trying: from the fraction that trials reach in the measured box follows the count of the
+         next. With `exchange`, shaken particles may also swap radii, which packs a wide spread denser than random
+         close packing.
+
+A trial depends on the request and its number alone; everything is serial, so a request has one packing.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .arrays import Floats
+from .case import Box, Case, CaseError, Particles, Problem
+from .heap import Heap
+from .pack_measures import solid_fraction, touching, volumes
+from .radii import draw
+
+TOLERANCE = 0.005  # of the solid fraction asked for
+OVERLAP = 0.005  # the largest that a packing may have, in mean radii
+ROUNDS = 500  # of shaking
+WORK = 20_000  # particles in all trials together, but at least FEWEST and at most MOST trials
+FEWEST, MOST = 8, 60
+SAMPLE = 10_000  # particles from which the mean volume is known before they are drawn
+
+
+@dataclass(frozen=True)
+class Request:
+    """What decides a packing: the table of the case, and the box in which a density is measured (None: all)."""
+
+    particles: Particles
+    container: Box
+    box: Box | None
+
+    @property
+    def size(self) -> Floats:
+        """Edges of the container (dim,)."""
+        return np.subtract(self.container[1], self.container[0])
+
+    @property
+    def low(self) -> Floats:
+        """Lower corner of the container."""
+        return np.array(self.container[0])
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return len(self.container[0])
+
+    def radii(self, count: int, rng: np.random.Generator) -> Floats:
+        """As many as asked, in random order."""
+        given = self.particles
+        spread = given.mean_radius or 0.0, given.std_radius or 0.0, given.truncation or 0.0, given.histogram
+        return draw(count, given.distribution or "normal", *spread, rng)
+
+    def measured(self, x: Floats, r: Floats) -> float:
+        """Solid fraction where the density is asked for."""
+        return solid_fraction(x, r, *map(np.array, self.box or self.container))
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Particles, and what they are like (see `describe`)."""
+
+    centres: Floats  # (n, dim)
+    radii: Floats  # (n,)
+    realised: dict[str, Any]
+
+
+def request(case: Case) -> Request:
+    """The packing that a case asks for. The vacancy box counts where it decides the packing and is in the container."""
+    given = case.particles
+    if given.source != "packing" or given.container is None:
+        raise CaseError([Problem("particles.source", given.source, "must be 'packing' for particles to be packed")])
+    box: Box | None = case.output.vacancy_box
+    low, high = np.array(given.container)
+    outside = (np.array(case.output.vacancy_box[0]) < low).any() or (np.array(case.output.vacancy_box[1]) > high).any()
+    if given.method == "pour" or given.packing_density is None or outside:
+        box = None
+    return Request(given, given.container, box)
+
+
+def make(wanted: Request) -> Packing:
+    """The packing. Raises `CaseError` with what can be reached where it cannot be what was asked."""
+    sample = wanted.radii(SAMPLE, np.random.default_rng(0))
+    mean_volume = float(volumes(sample, wanted.dim).mean())
+    smallest, edge = float(sample.min()), float(wanted.size.min())
+    if 2.0 * float(sample.max()) > edge:
+        allowed = f"no room for the largest particles: its shortest edge is {edge:g} nm, their diameter {2 * sample.max():.4g} nm"
+        raise _refusal("container", wanted.particles.container, allowed)
+    del smallest
+    density, count = wanted.particles.packing_density, wanted.particles.count
+    if count is None:
+        count = max(1, round((density or 0.0) * float(np.prod(wanted.size)) / mean_volume))
+    if wanted.particles.method == "pour":
+        return _pour(wanted, count)
+    if density is None:
+        return _press(wanted, count)
+    return _to_density(wanted, count, density)
+
+
+def _refusal(field: str, value: Any, allowed: str) -> CaseError:
+    return CaseError([Problem(f"particles.{field}", value, allowed)])
+
+
+def _amount(wanted: Request) -> tuple[str, Any]:
+    """The field that says how much, and its value."""
+    given = wanted.particles
+    return ("count", given.count) if given.count is not None else ("packing_density", given.packing_density)
+
+
+def _start(wanted: Request, count: int, trial: int) -> tuple[Heap, float]:
+    """The loose pile of a trial, and its unit of length, nm."""
+    rng = np.random.default_rng([wanted.particles.seed or 0, trial])
+    radii = wanted.radii(count, rng)
+    unit = float(radii.mean())
+    return Heap(radii / unit, wanted.size / unit, rng), unit
+
+
+def _finish(wanted: Request, heap: Heap, unit: float, trial: int) -> Packing | None:
+    """The heap in nm; None where it is no packing: an overlap, or a particle outside."""
+    centres, radii = heap.x[:, : wanted.dim] * unit + wanted.low, heap.r * unit
+    high = np.array(wanted.container[1])
+    contacts = touching(centres, radii, wanted.low, high)
+    if contacts.overlap > OVERLAP:
+        return None
+    # What presses on a wall is in it by less than that: move it inside.
+    centres = np.clip(centres, wanted.low + radii[:, None], high - radii[:, None])
+    return Packing(centres, radii, describe(wanted, centres, radii) | {"trial": trial})
+
+
+# --- the two ways
+
+
+def _pour(wanted: Request, count: int) -> Packing:
+    heap, unit = _start(wanted, count, 0)
+    rested = heap.pour(wanted.particles.friction or 0.0)
+    height = float(wanted.size[-1])
+    field, value = _amount(wanted)
+    if heap.top * unit > height * (1.0 + 1e-6):
+        fit = int(count * height / (heap.top * unit))
+        part = fit / count * float(volumes(heap.r * unit, wanted.dim).sum()) / float(np.prod(wanted.size))
+        most = f"about {fit}" if field == "count" else f"about {part:.3f}"
+        allowed = f"{count} poured particles reach {heap.top * unit:.4g} nm high in a container of {height:g} nm"
+        raise _refusal(field, value, f"{allowed}: at most {most}")
+    packing = _finish(wanted, heap, unit, 0) if rested else None
+    if packing is None:
+        raise _refusal(field, value, "the poured particles do not come to rest: another seed, or fewer particles")
+    return packing
+
+
+@dataclass
+class Trials:
+    """What trials have shown: solid fraction in the measured box over that in the container; where it jams."""
+
+    ratios: list[float]
+    lowest: float = math.inf
+    highest: float = 0.0
+    ceiling: float = math.inf  # count above which the heap jams before the container is reached
+    floor: float = 0.0  # count below which the pile does not reach the lid
+
+    def reached(self, fraction: float, ratio: float) -> None:
+        """A packing with this fraction was made."""
+        self.ratios.append(ratio)
+        self.lowest, self.highest = min(self.lowest, fraction), max(self.highest, fraction)
+
+
+def _to_density(wanted: Request, count: int, density: float) -> Packing:
+    """Try counts until the solid fraction in the measured box is the asked one, within TOLERANCE.
+
+    Where all of the container is measured, whole particles may not come that near: then the nearest count will do.
+    """
+    seen, per_particle = Trials([]), density / count
+    tolerance = max(TOLERANCE, 0.51 * per_particle if wanted.box is None else 0.0)
+    for trial in range(min(max(WORK // count, FEWEST), MOST)):
+        ratio = float(np.mean(seen.ratios)) if seen.ratios else 1.0
+        n = max(1, min(round(count / ratio), math.floor(seen.ceiling)), math.ceil(seen.floor))
+        found = _trial(wanted, n, trial, seen)
+        if found is None:
+            continue
+        fraction = wanted.measured(found.centres, found.radii)
+        seen.reached(fraction, fraction / (n * per_particle))
+        if abs(fraction - density) <= tolerance:
+            return found
+    raise _unreachable(wanted, count, seen)
+
+
+def _press(wanted: Request, count: int) -> Packing:
+    """Exactly `count` particles in the container."""
+    seen = Trials([])
+    for trial in range(min(max(WORK // count, FEWEST), MOST) // 4):
+        found = _trial(wanted, count, trial, seen)
+        if found is not None:
+            return found
+    low, high = math.ceil(seen.floor), seen.ceiling
+    most = f" to about {math.floor(high)}" if high < math.inf else ""
+    raise _refusal("count", count, f"cannot fill the container so that all hang together; reachable: {low}{most}")
+
+
+def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | None:
+    """Press `count` particles to the height of the container; None, and a note in `seen`, where that fails."""
+    heap, unit = _start(wanted, count, trial)
+    height, pile = float(wanted.size[-1]) / unit, heap.top
+    if pile < height:
+        seen.floor = max(seen.floor, count * height / pile)
+        return None
+    exchange = bool(wanted.particles.exchange)
+    if not (heap.anneal(height, ROUNDS) if exchange else heap.press(height)):
+        jammed = float(heap.high[heap.up])
+        seen.ceiling = min(seen.ceiling, max(count - 1, 1), count * height / jammed)
+        return None
+    heap.stick()
+    found = _finish(wanted, heap, unit, trial)
+    if found is None or not (found.realised["connected"] and found.realised["percolates"]):
+        return None
+    return found
+
+
+def _unreachable(wanted: Request, count: int, seen: Trials) -> CaseError:
+    """What can be reached, from the trials and from two more: the loosest pile and the densest heap."""
+    for n in _extremes(wanted, count, seen):
+        found = _trial(wanted, n, MOST, seen)
+        if found is not None:
+            seen.reached(wanted.measured(found.centres, found.radii), 1.0)
+    where = "the vacancy box" if wanted.box else "the container"
+    allowed = f"cannot be reached in {where} with this spread; reachable with this seed: {seen.lowest:.3f} to {seen.highest:.3f}"
+    return _refusal("packing_density", wanted.particles.packing_density, allowed)
+
+
+def _extremes(wanted: Request, count: int, seen: Trials) -> Iterator[int]:
+    """Counts of the loosest and the densest heap in the container."""
+    heap, unit = _start(wanted, count, MOST)
+    yield math.ceil(count * float(wanted.size[-1]) / unit / heap.top * 1.02) + 1
+    heap.press(0.0 + 1e-3)
+    dense = count * float(wanted.size[-1]) / unit / float(heap.high[heap.up])
+    yield math.floor(min(dense, seen.ceiling) * 0.98)
+
+
+# --- what it is like
+
+
+def describe(wanted: Request, centres: Floats, radii: Floats) -> dict[str, Any]:
+    """What goes into run.json: realised mean, spread, count, densities, coordination, and how the packing was made."""
+    low, high = wanted.low, np.array(wanted.container[1])
+    contacts = touching(centres, radii, low, high)
+    backbone, rattlers = contacts.backbone_coordination(wanted.dim)
+    given = wanted.particles
+    return {
+        "method": given.method,
+        "seed": given.seed,
+        "count": len(radii),
+        "mean_radius": float(radii.mean()),
+        "std_radius": float(radii.std()),
+        "packing_density": solid_fraction(centres, radii, low, high),
+        "coordination": contacts.coordination,
+        "backbone_coordination": backbone,
+        "rattlers": rattlers,
+        "largest_overlap": contacts.overlap,
+        "connected": contacts.clusters == 1,
+        "percolates": contacts.percolates(wanted.dim - 1),
+    }

@@ -12,7 +12,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count, pairwise, takewhile
 from pathlib import Path
@@ -34,7 +34,9 @@ from pydantic import (
 )
 from scipy.spatial import cKDTree
 
+from . import particle_file
 from .arrays import Flags, Floats
+from .particle_file import ParticleFileError
 
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
@@ -170,7 +172,7 @@ class Particles(Table):
     owned: ClassVar = {
         ("list", "sphere"): {"centres": ..., "radii": ...},
         ("list", "box"): {"centres": ..., "sizes": ...},
-        ("file", "sphere"): {"path": ...},
+        ("file", "sphere"): {"path": ..., "units": "nm"},
         ("packing", "sphere"): {"method": ..., "distribution": "normal", "mean_radius": None, "std_radius": None}
         | {"truncation": None, "histogram": (), "packing_density": None, "count": None, "seed": 0, "container": ...}
         | {"friction": 0.0, "exchange": False},
@@ -187,7 +189,9 @@ class Particles(Table):
     sizes: tuple[Edges, ...] = ()
     """edge lengths, nm: one set per particle (list of boxes)"""
     path: Text | None = None
-    """CSV of x,y[,z],radius, nm; relative to the case file (file)"""
+    """CSV of x,y[,z],radius, or a .cloud file of x y z r; relative to the case file (file)"""
+    units: Literal["nm", "um", "mm", "m"] | None = None
+    """of the lengths in that file (file; default nm)"""
     method: Literal["pour", "density"] | None = None
     """pour: gravity fills the container, along the last axis; density: a lid presses the particles in the container
     to a solid fraction (packing; default: density where packing_density is given, pour where count is)"""
@@ -400,8 +404,13 @@ class Case(Table):
     def _read_list(cls, particles: Particles, info: ValidationInfo) -> Particles:
         if particles.path is None or "domain" not in info.data:
             return particles
-        centres, radii = _read_csv(_absolute(particles.path, info), len(info.data["domain"].size))
-        return Particles(centres=centres, radii=radii, interface_width=particles.interface_width)
+        path = _absolute(particles.path, info)
+        try:
+            centres, radii = particle_file.read(path, len(info.data["domain"].size), particles.units or "nm")
+        except ParticleFileError as error:
+            raise CaseError(Problem("path", path, text) for text in error.problems) from error
+        width = particles.interface_width
+        return Particles(centres=centres.tolist(), radii=radii.tolist(), interface_width=width)
 
     @field_validator("output", mode="before")
     @classmethod
@@ -467,7 +476,8 @@ def _packing_problems(given: Particles) -> Iterator[Problem]:
     drawn = ("mean_radius", "std_radius", "truncation")
     if given.distribution != "histogram":
         if given.mean_radius is None:
-            yield Problem("mean_radius", None, f"must be given with source = 'packing'{_about(Particles, 'mean_radius')}")
+            about = _about(Particles, "mean_radius")
+            yield Problem("mean_radius", None, f"must be given with source = 'packing'{about}")
         if given.histogram:
             yield Problem("histogram", given.histogram, "belongs to distribution = 'histogram'")
     else:
@@ -635,34 +645,3 @@ def _known(loc: Place) -> str:
     close = difflib.get_close_matches(str(loc[-1]), known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"unknown key; allowed here: {', '.join(known)}{hint}"
-
-
-def _read_csv(path: str, dim: int) -> tuple[tuple[Point, ...], tuple[float, ...]]:
-    """Centres and radii. Blank lines, lines that start with # and a header `x,y[,z],radius` are skipped."""
-    names = [*"xyz"[:dim], "radius"]
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, ValueError) as error:
-        raise CaseError([Problem("path", path, f"cannot be read: {error}")]) from error
-    table = {n: [cell.strip() for cell in line.split(",")] for n, line in enumerate(lines, start=1)}
-    table = {n: cells for n, cells in table.items() if cells != [""] and not cells[0].startswith("#")}
-    if table and [cell.lower() for cell in table[min(table)]] == names:
-        del table[min(table)]
-    wrong = [text for n, cells in table.items() for text in _wrong_cells(n, cells, names)]
-    _refuse(Problem("path", path, text) for text in (wrong if table else ["holds no particles"]))
-    rows = [tuple(map(float, cells)) for cells in table.values()]
-    return tuple(row[:-1] for row in rows), tuple(row[-1] for row in rows)
-
-
-def _wrong_cells(line: int, cells: Sequence[str], names: Sequence[str]) -> Iterator[str]:
-    if len(cells) != len(names):
-        yield f"line {line} has {len(cells)} columns, must have {len(names)}: {','.join(names)}"
-        return
-    for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
-        try:
-            good = 0 < float(cell) < math.inf if name == "radius" else math.isfinite(float(cell))
-        except ValueError:
-            good = False
-        if not good:
-            allowed = "a number greater than 0" if name == "radius" else "a number"
-            yield f"line {line}, column {column} ({name}) is {cell!r}, must be {allowed}"

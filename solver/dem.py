@@ -58,37 +58,45 @@ def no_contacts() -> Contacts:
 
 
 @jit
-def deposit(x: Floats, r: Floats, place: Floats, low: Floats, high: Floats, dim: int) -> None:
-    """Ballistic deposition: each particle falls straight down at a random place and stays where it first touches.
+def deposit(x: Floats, r: Floats, place: Floats, low: Floats, high: Floats, dim: int, level: float) -> None:
+    """Ballistic deposition: each particle falls straight down and stays where it first touches.
 
-    place (n, dim - 1) in [0, 1) picks the place between the side walls. Particles are searched in columns of
-    twice the largest radius.
+    place (n, tries, dim - 1) in [0, 1) picks places between the side walls. A particle that would stay above the level
+    tries the next place; if all are above, it takes the lowest. So the pile has an even top.
     """
-    n, up, size = len(r), dim - 1, 2.0 * r.max()
+    n, tries, up, size = len(r), place.shape[1], dim - 1, 2.0 * r.max()
     nx = max(1, int((high[0] - low[0]) / size))
     ny = max(1, int((high[1] - low[1]) / size)) if dim == 3 else 1
     head, below = np.full((nx, ny), -1, np.int64), np.full(n, -1, np.int64)
     wx, wy = (high[0] - low[0]) / nx, (high[1] - low[1]) / ny
+    spot = np.zeros(3)
     for i in range(n):
-        x[i, 2] = 0.0
-        for k in range(up):
-            x[i, k] = low[k] + r[i] + place[i, k] * (high[k] - low[k] - 2.0 * r[i])
-        column_x = min(nx - 1, int((x[i, 0] - low[0]) / wx))
-        column_y = min(ny - 1, int((x[i, 1] - low[1]) / wy)) if dim == 3 else 0
-        floor = low[up] + r[i]
-        for cx in range(max(0, column_x - 1), min(nx, column_x + 2)):
-            for cy in range(max(0, column_y - 1), min(ny, column_y + 2)):
-                j = head[cx, cy]
-                while j >= 0:
-                    free = (r[i] + r[j]) ** 2
-                    for k in range(up):
-                        free -= (x[i, k] - x[j, k]) ** 2
-                    if free > 0.0:
-                        floor = max(floor, x[j, up] + math.sqrt(free))
-                    j = below[j]
-        x[i, up] = floor
-        below[i] = head[column_x, column_y]
-        head[column_x, column_y] = i
+        x[i] = 0.0
+        x[i, up] = np.inf
+        for t in range(tries):
+            for k in range(up):
+                spot[k] = low[k] + r[i] + place[i, t, k] * (high[k] - low[k] - 2.0 * r[i])
+            spot[up] = low[up] + r[i]
+            cx = min(nx - 1, int((spot[0] - low[0]) / wx))
+            cy = min(ny - 1, int((spot[1] - low[1]) / wy)) if dim == 3 else 0
+            for a in range(max(0, cx - 1), min(nx, cx + 2)):
+                for b in range(max(0, cy - 1), min(ny, cy + 2)):
+                    j = head[a, b]
+                    while j >= 0:
+                        free = (r[i] + r[j]) ** 2
+                        for k in range(up):
+                            free -= (spot[k] - x[j, k]) ** 2
+                        if free > 0.0:
+                            spot[up] = max(spot[up], x[j, up] + math.sqrt(free))
+                        j = below[j]
+            if spot[up] < x[i, up]:
+                x[i] = spot
+            if x[i, up] + r[i] <= level:
+                break
+        cx = min(nx - 1, int((x[i, 0] - low[0]) / wx))
+        cy = min(ny - 1, int((x[i, 1] - low[1]) / wy)) if dim == 3 else 0
+        below[i] = head[cx, cy]
+        head[cx, cy] = i
 
 
 @jit

@@ -12,9 +12,13 @@ from . import dem
 from .arrays import Floats, Integers
 from .pack_measures import near_pairs, touching, volumes
 
-RESTING = 0.004  # largest overlap of a heap that counts as relaxed; a packing may have 0.005
+LOOSEST = {2: 0.34, 3: 0.17}  # solid fraction of the pile between its walls, by dimension
+TRIES = 30  # places above which a pile is level that a particle tries
+RESTING = 0.002  # largest overlap of a heap that counts as relaxed, with particles and with walls
 DT = 0.12  # in units of sqrt(mass / stiffness); contacts of the lightest particles are stable up to about 0.3
-FALL = 0.05  # terminal velocity: a particle that lands is pressed in by about as much, for a moment
+FALL = 0.1  # terminal velocity: a particle that lands is pressed in by about as much, for a moment
+REST = 0.01  # of the velocity that a particle has after falling by half a radius: the mean one of a heap at rest
+STAGES, LONGEST = 8, 500  # of lowering gravity; times 100 steps, for each
 STRAIN = 1e-3  # of the press, per step: neighbours approach by 0.002 radii
 YIELDING = 0.02  # overlap at which the press waits for the heap to give way
 PATIENCE = 60  # times 50 steps, for which it waits
@@ -35,7 +39,8 @@ class Heap:
         self.x, self.v, self.spin = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self.contacts = dem.no_contacts()
         self.rng = rng
-        dem.deposit(self.x, self.r, rng.random((n, self.up)), self.low, self.high, self.dim)
+        level = float(volumes(self.r, self.dim).sum() / np.prod(box[:-1])) / LOOSEST[self.dim]
+        dem.deposit(self.x, self.r, rng.random((n, TRIES, self.up)), self.low, self.high, self.dim, level)
 
     @property
     def top(self) -> float:
@@ -54,26 +59,23 @@ class Heap:
         )  # fmt: skip
         return dem.Strain(*strain)
 
-    def pour(self, friction: float) -> bool:
-        """Let gravity pull until all is at rest; whether it came to rest.
+    def pour(self, friction: float) -> None:
+        """Let gravity pull until all is at rest.
 
-        The weight of all layers presses the lowest particle in by some 2 %; once at rest, gravity is lowered until the
-        largest overlap is small, each time to rest.
+        The weight of all layers presses the lowest particles in by some per cent; once at rest, gravity is lowered,
+        each time to rest, until the largest overlap is small.
         """
         layers = float(volumes(self.r, self.dim).sum()) / float(np.prod(self.high[: self.up])) / 2.0
         gravity, thick = 0.02 / max(layers, 1.0), 0.0
-        for _ in range(12):
-            drag = gravity / FALL + thick
-            for _ in range(1000):
+        for _ in range(STAGES):
+            for _ in range(LONGEST):
+                drag = gravity / FALL + thick
                 strain = self.march(100, gravity=gravity, friction=friction, drag=drag, lid=False)
-                if strain.speed < 0.02 * gravity**0.5:
+                if float(np.sqrt(np.mean(self.v**2))) < REST * gravity**0.5:
                     break
-            else:
-                return False
             if strain.overlap < RESTING:
-                return True
-            gravity, thick = 0.2 * gravity, 0.02
-        return False
+                return
+            gravity, thick = 0.15 * gravity, 0.02
 
     def press(self, height: float) -> bool:
         """Lower the lid to the height, waiting where the heap resists, then relax; False: it jams, at high[up]."""

@@ -4,6 +4,7 @@ Overlaps of particles are counted twice in a solid fraction: they are below 0.5 
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -159,7 +160,7 @@ def density_profile(
     """
     edges = np.linspace(low[-1], high[-1], slabs + 1)
     fractions = []
-    for bottom, top in zip(edges[:-1], edges[1:], strict=True):
+    for bottom, top in pairwise(edges):
         a, b = low + margin, high - margin
         a[-1], b[-1] = bottom, top
         fractions.append(solid_fraction(x, r, a, b))

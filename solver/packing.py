@@ -14,7 +14,6 @@ A trial depends on the request and its number alone; everything is serial, so a 
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,11 +93,10 @@ def make(wanted: Request) -> Packing:
     """The packing. Raises `CaseError` with what can be reached where it cannot be what was asked."""
     sample = wanted.radii(SAMPLE, np.random.default_rng(0))
     mean_volume = float(volumes(sample, wanted.dim).mean())
-    smallest, edge = float(sample.min()), float(wanted.size.min())
-    if 2.0 * float(sample.max()) > edge:
-        allowed = f"no room for the largest particles: its shortest edge is {edge:g} nm, their diameter {2 * sample.max():.4g} nm"
+    edge, widest = float(wanted.size.min()), 2.0 * float(sample.max())
+    if widest > edge:
+        allowed = f"no room for the largest particles, {widest:.4g} nm wide: its shortest edge is {edge:g} nm"
         raise _refusal("container", wanted.particles.container, allowed)
-    del smallest
     density, count = wanted.particles.packing_density, wanted.particles.count
     if count is None:
         count = max(1, round((density or 0.0) * float(np.prod(wanted.size)) / mean_volume))
@@ -131,12 +129,10 @@ def _finish(wanted: Request, heap: Heap, unit: float, trial: int) -> Packing | N
     """The heap in nm; None where it is no packing: an overlap, or a particle outside."""
     centres, radii = heap.x[:, : wanted.dim] * unit + wanted.low, heap.r * unit
     high = np.array(wanted.container[1])
-    contacts = touching(centres, radii, wanted.low, high)
-    if contacts.overlap > OVERLAP:
-        return None
-    # What presses on a wall is in it by less than that: move it inside.
+    # What presses on a wall is in it by a little: move it inside.
     centres = np.clip(centres, wanted.low + radii[:, None], high - radii[:, None])
-    return Packing(centres, radii, describe(wanted, centres, radii) | {"trial": trial})
+    packing = Packing(centres, radii, describe(wanted, centres, radii) | {"trial": trial})
+    return packing if packing.realised["largest_overlap"] <= OVERLAP else None
 
 
 # --- the two ways
@@ -144,7 +140,7 @@ def _finish(wanted: Request, heap: Heap, unit: float, trial: int) -> Packing | N
 
 def _pour(wanted: Request, count: int) -> Packing:
     heap, unit = _start(wanted, count, 0)
-    rested = heap.pour(wanted.particles.friction or 0.0)
+    heap.pour(wanted.particles.friction or 0.0)
     height = float(wanted.size[-1])
     field, value = _amount(wanted)
     if heap.top * unit > height * (1.0 + 1e-6):
@@ -153,26 +149,42 @@ def _pour(wanted: Request, count: int) -> Packing:
         most = f"about {fit}" if field == "count" else f"about {part:.3f}"
         allowed = f"{count} poured particles reach {heap.top * unit:.4g} nm high in a container of {height:g} nm"
         raise _refusal(field, value, f"{allowed}: at most {most}")
-    packing = _finish(wanted, heap, unit, 0) if rested else None
+    packing = _finish(wanted, heap, unit, 0)
     if packing is None:
-        raise _refusal(field, value, "the poured particles do not come to rest: another seed, or fewer particles")
+        raise _refusal(field, value, "the poured particles do not come to rest; another seed may help")
     return packing
 
 
-@dataclass
 class Trials:
-    """What trials have shown: solid fraction in the measured box over that in the container; where it jams."""
+    """What trials have shown: the fraction in the measured box over that of the container, and between which counts."""
 
-    ratios: list[float]
-    lowest: float = math.inf
-    highest: float = 0.0
-    ceiling: float = math.inf  # count above which the heap jams before the container is reached
-    floor: float = 0.0  # count below which the pile does not reach the lid
+    def __init__(self, per_particle: float) -> None:
+        """per_particle: the part of the container that a mean particle fills."""
+        self.per_particle = per_particle
+        self.ratios: list[float] = []
+        self.fractions: list[float] = []
+        self.jams: list[float] = []  # counts with which heaps would have jammed at the height of the container
+        self.floor = 1  # below this count the pile does not reach the lid
 
-    def reached(self, fraction: float, ratio: float) -> None:
+    def reached(self, fraction: float, count: int) -> None:
         """A packing with this fraction was made."""
-        self.ratios.append(ratio)
-        self.lowest, self.highest = min(self.lowest, fraction), max(self.highest, fraction)
+        self.fractions.append(fraction)
+        self.ratios.append(fraction / (count * self.per_particle))
+
+    @property
+    def ceiling(self) -> float:
+        """Count that fits every other time: a heap jams a little early or late."""
+        return 0.99 * float(np.mean(self.jams)) if self.jams else math.inf
+
+    def count(self, fraction: float) -> int:
+        """To try next for this fraction in the measured box, from the latest trials."""
+        ratio = float(np.mean(self.ratios[-6:])) if self.ratios else 1.0
+        return max(int(min(fraction / (self.per_particle * ratio) + 0.5, self.ceiling)), self.floor)
+
+    def hopeless(self, fraction: float, tolerance: float) -> bool:
+        """Whether the densest of several heaps, all as dense as they get, is far from this fraction."""
+        best = max(self.fractions, default=0.0)
+        return len(self.jams) >= 5 and len(self.fractions) >= 3 and best < fraction - 4.0 * tolerance
 
 
 def _to_density(wanted: Request, count: int, density: float) -> Packing:
@@ -180,31 +192,35 @@ def _to_density(wanted: Request, count: int, density: float) -> Packing:
 
     Where all of the container is measured, whole particles may not come that near: then the nearest count will do.
     """
-    seen, per_particle = Trials([]), density / count
-    tolerance = max(TOLERANCE, 0.51 * per_particle if wanted.box is None else 0.0)
-    for trial in range(min(max(WORK // count, FEWEST), MOST)):
-        ratio = float(np.mean(seen.ratios)) if seen.ratios else 1.0
-        n = max(1, min(round(count / ratio), math.floor(seen.ceiling)), math.ceil(seen.floor))
+    seen = Trials(density / count)
+    tolerance = max(TOLERANCE, 0.51 * seen.per_particle if wanted.box is None else 0.0)
+    for trial in range(_trials(count)):
+        n = seen.count(density)
         found = _trial(wanted, n, trial, seen)
-        if found is None:
-            continue
-        fraction = wanted.measured(found.centres, found.radii)
-        seen.reached(fraction, fraction / (n * per_particle))
-        if abs(fraction - density) <= tolerance:
-            return found
+        if found is not None:
+            fraction = wanted.measured(found.centres, found.radii)
+            seen.reached(fraction, n)
+            if abs(fraction - density) <= tolerance:
+                return found
+        if seen.hopeless(density, tolerance):
+            break
     raise _unreachable(wanted, count, seen)
+
+
+def _trials(count: int) -> int:
+    return min(max(WORK // count, FEWEST), MOST)
 
 
 def _press(wanted: Request, count: int) -> Packing:
     """Exactly `count` particles in the container."""
-    seen = Trials([])
-    for trial in range(min(max(WORK // count, FEWEST), MOST) // 4):
+    seen = Trials(1.0)
+    for trial in range(_trials(count) // 4):
         found = _trial(wanted, count, trial, seen)
         if found is not None:
             return found
-    low, high = math.ceil(seen.floor), seen.ceiling
-    most = f" to about {math.floor(high)}" if high < math.inf else ""
-    raise _refusal("count", count, f"cannot fill the container so that all hang together; reachable: {low}{most}")
+    least, most = _extremes(wanted, count, seen)
+    allowed = f"cannot fill the container so that all hang together; reachable: about {least} to {most}"
+    raise _refusal("count", count, allowed)
 
 
 def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | None:
@@ -212,12 +228,12 @@ def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | N
     heap, unit = _start(wanted, count, trial)
     height, pile = float(wanted.size[-1]) / unit, heap.top
     if pile < height:
-        seen.floor = max(seen.floor, count * height / pile)
+        seen.floor = max(seen.floor, math.ceil(count * height / pile))
         return None
     exchange = bool(wanted.particles.exchange)
     if not (heap.anneal(height, ROUNDS) if exchange else heap.press(height)):
         jammed = float(heap.high[heap.up])
-        seen.ceiling = min(seen.ceiling, max(count - 1, 1), count * height / jammed)
+        seen.jams.append(min(count - 0.5, count * height / jammed))
         return None
     heap.stick()
     found = _finish(wanted, heap, unit, trial)
@@ -227,23 +243,26 @@ def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | N
 
 
 def _unreachable(wanted: Request, count: int, seen: Trials) -> CaseError:
-    """What can be reached, from the trials and from two more: the loosest pile and the densest heap."""
-    for n in _extremes(wanted, count, seen):
-        found = _trial(wanted, n, MOST, seen)
+    """What can be reached, from the trials and from a few more near the loosest and the densest heap."""
+    least, most = _extremes(wanted, count, seen)
+    for k, n in enumerate((least, math.ceil(1.05 * least), math.floor(0.97 * most), math.floor(0.99 * most))):
+        found = _trial(wanted, n, MOST + k, seen)
         if found is not None:
-            seen.reached(wanted.measured(found.centres, found.radii), 1.0)
+            seen.reached(wanted.measured(found.centres, found.radii), n)
     where = "the vacancy box" if wanted.box else "the container"
-    allowed = f"cannot be reached in {where} with this spread; reachable with this seed: {seen.lowest:.3f} to {seen.highest:.3f}"
+    lowest, highest = min(seen.fractions, default=math.nan), max(seen.fractions, default=math.nan)
+    allowed = f"cannot be reached in {where} with this spread and seed; reachable: about {lowest:.3f} to {highest:.3f}"
     return _refusal("packing_density", wanted.particles.packing_density, allowed)
 
 
-def _extremes(wanted: Request, count: int, seen: Trials) -> Iterator[int]:
+def _extremes(wanted: Request, count: int, seen: Trials) -> tuple[int, int]:
     """Counts of the loosest and the densest heap in the container."""
-    heap, unit = _start(wanted, count, MOST)
-    yield math.ceil(count * float(wanted.size[-1]) / unit / heap.top * 1.02) + 1
-    heap.press(0.0 + 1e-3)
-    dense = count * float(wanted.size[-1]) / unit / float(heap.high[heap.up])
-    yield math.floor(min(dense, seen.ceiling) * 0.98)
+    heap, unit = _start(wanted, max(count, 4), MOST)
+    height, n = float(wanted.size[-1]) / unit, len(heap.r)
+    least = math.ceil(n * height / heap.top)
+    heap.press(1e-3 * height)
+    jammed = n * height / float(heap.high[heap.up])
+    return max(least, seen.floor), math.floor(np.mean([*seen.jams, jammed]))
 
 
 # --- what it is like

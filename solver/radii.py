@@ -42,7 +42,7 @@ def draw(
         raw = mean * np.exp(width * _normal(levels, -truncation, truncation) - 0.5 * width**2)
     else:
         raw = mean + std * _normal(levels, max(-truncation, (SMALLEST - 1.0) * mean / std), truncation)
-    return np.maximum(mean + (raw - raw.mean()) * (std / raw.std()), SMALLEST * mean)
+    return np.asarray(np.maximum(mean + (raw - raw.mean()) * (std / raw.std()), SMALLEST * mean))
 
 
 def _normal(levels: Floats, low: float, high: float) -> Floats:

@@ -17,7 +17,7 @@ TRIES = 30  # places above which a pile is level that a particle tries
 RESTING = 0.002  # largest overlap of a heap that counts as relaxed, with particles and with walls
 DT = 0.12  # in units of sqrt(mass / stiffness); contacts of the lightest particles are stable up to about 0.3
 FALL = 0.1  # terminal velocity: a particle that lands is pressed in by about as much, for a moment
-REST = 0.01  # of the velocity that a particle has after falling by half a radius: the mean one of a heap at rest
+REST = 0.01  # mean speed of a heap at rest, over that after a fall of half a radius; the fastest may have ten times it
 STAGES, LONGEST = 8, 500  # of lowering gravity; times 100 steps, for each
 STRAIN = 1e-3  # of the press, per step: neighbours approach by 0.002 radii
 YIELDING = 0.02  # overlap at which the press waits for the heap to give way
@@ -71,7 +71,8 @@ class Heap:
             for _ in range(LONGEST):
                 drag = gravity / FALL + thick
                 strain = self.march(100, gravity=gravity, friction=friction, drag=drag, lid=False)
-                if float(np.sqrt(np.mean(self.v**2))) < REST * gravity**0.5:
+                slow = REST * gravity**0.5
+                if strain.speed < 10.0 * slow and float(np.sqrt(np.mean(self.v**2))) < slow:
                     break
             if strain.overlap < RESTING:
                 return

@@ -29,6 +29,11 @@ def solid_fraction(x: Floats, r: Floats, low: Floats, high: Floats) -> float:
 
 def parts_inside(x: Floats, r: Floats, low: Floats, high: Floats) -> Floats:
     """Volume (n,) of each particle inside the box: discs exactly, spheres as a stack of discs."""
+    with np.errstate(under="ignore"):
+        return _parts_inside(x, r, low, high)
+
+
+def _parts_inside(x: Floats, r: Floats, low: Floats, high: Floats) -> Floats:
     dim = x.shape[1]
     inside = ((x - r[:, None] >= low) & (x + r[:, None] <= high)).all(axis=1)
     outside = ((x + r[:, None] <= low) | (x - r[:, None] >= high)).any(axis=1)

@@ -172,10 +172,9 @@ def march(
 ) -> tuple[Contacts, Strain]:  # fmt: skip
     """`steps` steps of semi-implicit Euler in place: v += dt f / m, x += dt v; `high` follows the squeeze."""
     n, dim, dt, up = len(r), physics.dim, physics.dt, physics.dim - 1
-    mass, weight = np.empty(n), np.empty(n)
+    mass = np.empty(n)
     for i in range(n):
-        weight[i] = r[i] ** dim
-        mass[i] = max(weight[i], 0.3)  # light ones are as inert as this: they would ask for shorter steps
+        mass[i] = max(r[i] ** dim, 0.3)  # light ones are as heavy as this: they would ask for shorter steps
     inertia = 0.4 if dim == 3 else 0.5
     force, torque = np.zeros((n, 3)), np.zeros((n, 3))
     overlap, pushed, pairs = 0.0, 0.0, 0
@@ -190,7 +189,7 @@ def march(
         overlap, pushed, pairs = pair_forces(force, torque, x, v, spin, r, mass, contacts, physics)
         overlap = max(overlap, wall_forces(force, x, v, r, mass, low, high, physics))
         for i in range(n):
-            force[i, up] -= physics.gravity * weight[i]
+            force[i, up] -= physics.gravity * mass[i]
             for k in range(3):
                 v[i, k] = (v[i, k] + dt * force[i, k] / mass[i]) / (1.0 + dt * physics.drag)
                 x[i, k] += dt * v[i, k]

@@ -94,16 +94,17 @@ class Touching:
         """Mean number of neighbours, rattlers included."""
         return float(self.counts.mean())
 
-    def backbone_coordination(self, dim: int) -> tuple[float, float]:
+    def backbone_coordination(self, needed: int) -> tuple[float, float]:
         """Mean number of neighbours without rattlers, and the fraction of these.
 
-        A rattler has fewer than dim + 1 contacts, walls included, not counting those with rattlers.
+        A rattler has fewer contacts than needed to hold it, walls included, not counting those with rattlers: dim + 1
+        hold a particle without gravity, dim with it.
         """
         kept = np.ones(len(self.counts), dtype=bool)
         while True:
             good = self.pairs[kept[self.pairs].all(axis=1)]
             neighbours = np.bincount(good.ravel(), minlength=len(kept))
-            held = kept & (neighbours + self.walls.sum(axis=(1, 2)) > dim)
+            held = kept & (neighbours + self.walls.sum(axis=(1, 2)) >= needed)
             if (held == kept).all():
                 mean = float(neighbours[kept].mean()) if kept.any() else 0.0
                 return mean, float(1.0 - kept.mean())

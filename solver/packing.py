@@ -245,10 +245,14 @@ def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | N
 def _unreachable(wanted: Request, count: int, seen: Trials) -> CaseError:
     """What can be reached, from the trials and from a few more near the loosest and the densest heap."""
     least, most = _extremes(wanted, count, seen)
-    for k, n in enumerate((least, math.ceil(1.05 * least), math.floor(0.97 * most), math.floor(0.99 * most))):
-        found = _trial(wanted, n, MOST + k, seen)
-        if found is not None:
-            seen.reached(wanted.measured(found.centres, found.radii), n)
+    loose = [math.ceil(least * factor) for factor in (1.0, 1.1, 1.25, 1.5)]
+    dense = [math.floor(most * factor) for factor in (0.99, 0.97)]
+    for counts in (loose, dense):
+        for k, n in enumerate(counts):
+            found = _trial(wanted, n, MOST + k, seen)
+            if found is not None:
+                seen.reached(wanted.measured(found.centres, found.radii), n)
+                break
     where = "the vacancy box" if wanted.box else "the container"
     lowest, highest = min(seen.fractions, default=math.nan), max(seen.fractions, default=math.nan)
     allowed = f"cannot be reached in {where} with this spread and seed; reachable: about {lowest:.3f} to {highest:.3f}"
@@ -272,8 +276,8 @@ def describe(wanted: Request, centres: Floats, radii: Floats) -> dict[str, Any]:
     """What goes into run.json: realised mean, spread, count, densities, coordination, and how the packing was made."""
     low, high = wanted.low, np.array(wanted.container[1])
     contacts = touching(centres, radii, low, high)
-    backbone, rattlers = contacts.backbone_coordination(wanted.dim)
     given = wanted.particles
+    backbone, rattlers = contacts.backbone_coordination(wanted.dim + (given.method != "pour"))
     return {
         "method": given.method,
         "seed": given.seed,

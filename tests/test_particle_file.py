@@ -47,7 +47,7 @@ def test_unknown_units_are_refused(tmp_path: Path) -> None:
         '[domain]\nsize = [60.0, 60.0]\n[nodes]\nspacing = 1.0\n[time]\nend = 1.0\n'
         '[particles]\nsource = "file"\npath = "p.csv"\nunits = "inch"\n'
     )
-    with pytest.raises(CaseError, match="particles.units = 'inch': must be 'nm', 'um', 'mm' or 'm'"):
+    with pytest.raises(CaseError, match=r"particles\.units = 'inch': must be 'nm', 'um', 'mm' or 'm'"):
         load_case(tmp_path / "case.toml")
 
 

@@ -6,6 +6,7 @@ What a command imports beyond the terminal is imported inside it: `frit --help` 
 
 import json
 import math
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -141,6 +142,34 @@ def plot(
 
 
 commands_server.add_to(app)
+
+
+@app.command("pack")
+def pack_only(
+    case: CaseFile,
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", dir_okay=False, help="Particles: x,y[,z],radius, nm.")],
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: beside the CSV; .pdf, .svg too.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the packing only: a CSV, a picture, and what it is like."""
+    from . import pack
+
+    check_case(case)
+    try:
+        report = pack.pack(case, out, dict(os.environ))
+        picture = picture or out.with_suffix(".png")
+        pack.draw(out, report, f"{case.stem}: {report['packing']['count']} particles", picture)
+    except (ValueError, OSError) as error:
+        refuse(str(error))
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+        return
+    console = Console(highlight=False)
+    for table in pack.tables(report):
+        console.print(table, "")
+    typer.echo(f"{out}, {picture}")
 
 
 @app.command()

@@ -42,7 +42,7 @@ def create_app(settings: Settings) -> FastAPI:
         title="frit", version=openapi.version(), description=openapi.DESCRIPTION, lifespan=lifespan,
         generate_unique_id_function=lambda route: route.name,
     )  # fmt: skip
-    handle_problems(app)
+    handle_problems(app, [*api.routes, *plain.routes])
     app.include_router(api)
     app.include_router(plain)
 
@@ -157,7 +157,7 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
     def page() -> tuple[views.JobPage, str | None]:
         selection = filters.select(request.query_params.multi_items(), lambda name: store.sweep(name).seq)
         value = None if selection.scalar is None else selection.scalar.sql
-        found = store.page(selection.where, selection.order, selection.limit + 1, value)
+        found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.indexed)
         shown = [views.summary(job, hidden(engine)) for job, _ in found[: selection.limit]]
         following = None
         if len(found) > selection.limit:

@@ -12,7 +12,7 @@ import typer
 from .words import AsJson, DataFolder, SweepFile, fail, refuse, show_table
 
 if TYPE_CHECKING:
-    from .client import Client, RemoteJob, RemoteSweep
+    from .client import Client, RemoteJob
     from .views import Comparison
 
 Url = Annotated[str, typer.Option("--url", envvar="FRIT_URL", metavar="URL", help="Address of the service.")]
@@ -68,19 +68,22 @@ def submit(
     as_json: AsJson = False,
 ) -> None:
     """Submit a case or a sweep to a service."""
+    from .client import RemoteJob
+
     options = {"ranks": ranks, "name": name, "priority": priority, "tags": tag or None, "time_limit": time_limit}
     with speaking(url, token, str(file)) as client:
-        submitted = client.submit(file, **{key: value for key, value in options.items() if value is not None})  # type: ignore[arg-type]
+        given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
+        submitted = client.submit(file, **given)
         if wait:
             submitted.wait()
-        found = [submitted] if submitted.id.count("s") == 0 else list(submitted.jobs())  # type: ignore[union-attr]
+        found = [submitted] if isinstance(submitted, RemoteJob) else list(submitted.jobs())
         if as_json:
             typer.echo(json.dumps(submitted.data, indent=2))
         else:
             typer.echo(submitted.id)
             if wait:
                 show_table([row(job) for job in found])
-        if wait and any(job.state != "succeeded" for job in found):  # type: ignore[union-attr]
+        if wait and any(job.state != "succeeded" for job in found):
             raise typer.Exit(1)
 
 
@@ -178,7 +181,10 @@ def compare(
 
     if out is not None and out.suffix not in (*CURVES, ".html", ".csv"):
         refuse(f"--out {out}: must end in {', '.join(CURVES)}, .html or .csv")
-    found = compared_here(data, sweep, observable) if data is not None else compared_there(url, token, sweep, observable)
+    if data is not None:
+        found = compared_here(data, sweep, observable)
+    else:
+        found = compared_there(url, token, sweep, observable)
     lines = [
         curves.Curve(c["name"], c["parameters"], c["time"], c["values"]) for c in found["curves"] if c["time"]
     ]  # fmt: skip
@@ -264,7 +270,7 @@ def wrong_field(wrong: dict[str, Any]) -> str:
     return f"{where} = {wrong.get('value')!r}: {wrong.get('detail')}"
 
 
-def row(job: "RemoteJob | RemoteSweep") -> dict[str, Any]:
+def row(job: "RemoteJob") -> dict[str, Any]:
     """Of the table of jobs."""
     data = job.data
     result = data.get("result") or {}

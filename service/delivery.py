@@ -119,7 +119,7 @@ async def _read(handle: int, size: int, first: int) -> bytes:
 def file_beneath(request: Request, root: Path, path: str, media_type: str) -> Response:
     """The file at `path` below `root`, or the problem that there is none."""
     if (handle := open_beneath(root, path.split("/"))) is None:
-        raise not_found(f"{path!r}: there is no such file")
+        raise not_found("there is no such key in the store")
     return file_response(request, handle, media_type)
 
 

@@ -35,10 +35,14 @@ OPERATORS = ("eq", "ne", *ORDERING, "in")
 COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
     name: getattr(operator, name) for name in ("eq", "ne", *ORDERING)
 }  # fmt: skip
-RESERVED = ("state", "sweep", "tag", "order", "limit", "cursor")
+INDEXED = ("particles.mean_radius", "particles.std_radius", "particles.packing_density", "result.vacancy_ratio")
 RESULTS = ("time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "particles", "evaluations",
            "wall_time", "neck_length", "centre_distance")  # fmt: skip
 PACKING = re.compile(r"result\.packing(\.[A-Za-z_][A-Za-z0-9_]*){1,3}")
+
+
+# The state as SQLite does not look it up in an index: another one is better.
+AFTER_OTHERS: sa.ColumnElement[Any] = sa.literal_column("+jobs.state")
 
 
 @dataclass(frozen=True)
@@ -60,11 +64,8 @@ class Selection:
     by: str
     scalar: Scalar | None
     """what is ordered by before the order of submission"""
-
-    @property
-    def descending(self) -> bool:
-        """Whether the largest comes first."""
-        return self.by.startswith("-")
+    indexed: bool
+    """whether an index has what is filtered by"""
 
 
 class WrongQueryError(ValueError):
@@ -147,34 +148,39 @@ def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -
     given: dict[str, list[str]] = {}
     for name, value in parameters:
         given.setdefault(name, []).append(value)
+    by = given.get("order", ["-created"])[-1]
+    indexed = any(name.startswith(INDEXED) and not name.endswith(".ne") for name in given)
+    state = AFTER_OTHERS if indexed or by.removeprefix("-") in INDEXED else jobs.c.state
     for name, values in given.items():
         try:
             if name not in ("order", "limit", "cursor"):
-                where.extend(_conditions(name, values, sweep))
+                where.extend(_conditions(name, values, sweep, state))
         except WrongQueryError as error:
             wrong.append(error.field)
-    by, limit, scalar = "-created", PAGE, None
+    limit, scalar = PAGE, None
     try:
-        by = given.get("order", ["-created"])[-1]
         scalar = _order(by)
         limit = _limit(given.get("limit", [str(PAGE)])[-1])
-        if "cursor" in given:
-            where.append(_after(given["cursor"][-1], by, scalar))
+        if place := given.get("cursor", [""])[-1]:
+            where.append(_after(place, by, scalar))
     except WrongQueryError as error:
         wrong.append(error.field)
     if wrong:
         raise refused("refused-query", "The query is refused", wrong)
     direction = sa.desc if by.startswith("-") else sa.asc
     first = () if scalar is None else (direction(scalar.sql),)
-    return Selection(sa.and_(sa.true(), *where), (*first, direction(jobs.c.seq)), limit, by, scalar)
+    order = (*first, direction(jobs.c.seq))
+    return Selection(sa.and_(sa.true(), *where), order, limit, by, scalar, indexed and scalar is None)
 
 
-def _conditions(name: str, values: list[str], sweep: Callable[[str], int]) -> Iterator[Condition]:
+def _conditions(
+    name: str, values: list[str], sweep: Callable[[str], int], state: sa.ColumnElement[Any]
+) -> Iterator[Condition]:
     if name == "state":
         states = [state for value in values for state in value.split(",")]
         if unknown := [state for state in states if state not in list(State)]:
             raise WrongQueryError(name, unknown[0], f"must be one of {', '.join(State)}")
-        yield jobs.c.state == states[0] if len(states) == 1 else jobs.c.state.in_(states)
+        yield state == states[0] if len(states) == 1 else state.in_(states)
     elif name == "sweep":
         for value in values:
             yield jobs.c.seq.in_(sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep(value)))

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fastapi import FastAPI
+from fastapi.responses import PlainTextResponse
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
@@ -47,5 +48,5 @@ def expose(app: FastAPI, engine: Callable[[], Engine], **route: Any) -> None:
     registry = CollectorRegistry()
     registry.register(Jobs(engine))
     Instrumentator(registry=registry, excluded_handlers=["/metrics", "/livez", "/readyz"]).instrument(app).expose(
-        app, include_in_schema=True, **route
+        app, include_in_schema=True, response_class=PlainTextResponse, **route
     )

@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import FastAPI
 
 from . import filters
+from .jobs import State
 from .problems import MEDIA_TYPE, ProblemDetails
 
 DESCRIPTION = """Runs sintering cases and sweeps of them, and keeps what they give findable.
@@ -93,12 +94,14 @@ def file(media_type: str) -> Responses:
 
 def _filters() -> dict[str, Any]:
     """Query parameters of the list of jobs."""
-    states = {"type": "string", "description": "One state, or several between commas."}
+    one = f"({'|'.join(State)})"
+    states = {"type": "string", "pattern": f"^{one}(,{one})*$", "example": "queued,running"}
+    orders = [f"{sign}{key}" for key in filters.known() for sign in ("", "-")]
     named: list[tuple[str, dict[str, Any], str]] = [
         ("state", states, "Jobs in one of these states."),
         ("sweep", {"type": "string"}, "Jobs of a sweep, by its id or name."),
         ("tag", {"type": "string"}, "Jobs with a tag."),
-        ("order", {"type": "string"}, "A key; - before it: the largest first. Default: -created."),
+        ("order", {"type": "string", "enum": orders, "default": "-created"}, "A key; - before it: the largest first."),
         ("limit", {"type": "integer", "minimum": 1, "maximum": filters.LARGEST_PAGE}, "Jobs on the page."),
         ("cursor", {"type": "string"}, "From `next` of the page before."),
     ]

@@ -9,9 +9,11 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.routing import BaseRoute
 
 from frit.solver.case import CaseError
 
@@ -134,11 +136,16 @@ def shown(value: Any) -> Any:
     return value if isinstance(value, list | tuple | dict) and text[:1] in "[{" else text
 
 
-def handle_problems(app: FastAPI) -> None:
+def handle_problems(app: FastAPI, routes: Sequence[BaseRoute]) -> None:
     """Have every error of the app answered as a problem."""
 
-    async def problem(_: Request, error: Exception) -> Response:
-        return as_problem(error).response()
+    async def problem(request: Request, error: Exception) -> Response:
+        problem = as_problem(error)
+        if problem.details.status == 405:  # a route knows only its own method
+            fitting = [r for r in routes if isinstance(r, APIRoute) and r.path_regex.match(request.url.path)]
+            methods = {method for route in fitting for method in route.methods or ()}
+            problem.headers["Allow"] = ", ".join(sorted(methods))
+        return problem.response()
 
     kinds = (HttpError, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError)
     for kind in (*kinds, TransitionError, Exception):

@@ -66,6 +66,8 @@ Index("ix_jobs_queue", jobs.c.state, jobs.c.priority.desc(), jobs.c.seq)
 Index("ix_jobs_state_seq", jobs.c.state, jobs.c.seq)
 for key in ("mean_radius", "std_radius", "packing_density"):  # what sweeps are made of
     Index(f"ix_jobs_{key}", func.json_extract(jobs.c.case, literal_column(f"'$.particles.{key}'")))
+# ... and what they lead to
+Index("ix_jobs_vacancy_ratio", func.json_extract(jobs.c.result, literal_column("'$.vacancy_ratio'")))
 
 sweep_jobs = Table(
     "sweep_jobs",

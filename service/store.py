@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -28,6 +28,7 @@ from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
+FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
 SUCCEEDED = 1 << 60  # more than any seq
 TROUBLE = {  # primary codes of SQLite's that tell of the database and its disk, not of one statement
@@ -151,6 +152,18 @@ class _Work:
     answer: Future[Any]
 
 
+@dataclass(frozen=True)
+class _Submission:
+    """Work that is done for many at once: a job to be queued."""
+
+    job: NewJob
+    key: Key | None
+    answer: Future[Any]
+
+
+_Piece = tuple[Sequence[_Work | _Submission], Callable[[Transaction], Sequence[Any]]]
+
+
 class Store:
     """The index of one data folder. Methods that change it give a future, done once the change is durable."""
 
@@ -169,7 +182,7 @@ class Store:
                 self._writer.connect().close()  # the log must be there before the first reader is
             except DBAPIError as error:
                 raise StoreError(f"{self.path}: {_words(error)}") from error
-        self._waiting: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[_Work | _Submission | None] = queue.SimpleQueue()
         self._door = threading.Lock()
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
@@ -192,7 +205,9 @@ class Store:
 
     def write(self, effect: "Callable[[Transaction], T]") -> "Future[T]":
         """Have the effect done in a transaction; the future is done when it is durable."""
-        work = _Work(effect, Future())
+        return self._put(_Work(effect, Future()))
+
+    def _put(self, work: "_Work | _Submission") -> "Future[Any]":
         with self._door:
             if self._closed:
                 raise StoreError(f"{self.path}: closed, or opened for reading only")
@@ -201,42 +216,47 @@ class Store:
 
     def _write(self) -> None:
         while (work := self._waiting.get()) is not None:
-            batch: list[_Work | None] = [work]
+            batch: list[_Work | _Submission | None] = [work]
             while len(batch) < BATCH and not self._waiting.empty():
                 batch.append(self._waiting.get())
             self._commit([work for work in batch if work is not None])
             if batch[-1] is None:
                 return
 
-    def _commit(self, batch: Sequence[_Work]) -> None:
+    def _commit(self, batch: Sequence[_Work | _Submission]) -> None:
         batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
-        answers: list[tuple[_Work, Any]] = []
-        refused: list[tuple[_Work, Exception]] = []
+        answers: list[tuple[_Work | _Submission, Any]] = []
         done: list[Transaction] = []
+        pieces = _pieces(batch)
         try:
             with self._writer.connect() as connection, self._journalled() as write, connection.begin():
-                for work in batch:
+                while pieces:
+                    works, effect = pieces.pop(0)
                     transaction = Transaction(connection)
                     try:
                         with connection.begin_nested():
-                            answer = work.effect(transaction)
-                        answers.append((work, answer))
+                            results = effect(transaction)
+                        answers += zip(works, results, strict=True)
                         done.append(transaction)
                     except Exception as error:
                         if _spoils_all(connection, error):
                             raise
-                        refused.append((work, error))
+                        if len(works) == 1:
+                            answers.append((works[0], error))
+                        else:  # one of them is bad, the others are not
+                            pieces += [piece for work in works for piece in _pieces([work])]
                 write("".join(line for transaction in done for line in transaction.lines), any(t.durable for t in done))
         except Exception as error:
             trouble = StoreError(f"{self.path}: {_words(error)}")
             trouble.__cause__ = error
-            for work in batch:
-                work.answer.set_exception(trouble)
+            for piece in batch:
+                piece.answer.set_exception(trouble)
             return
-        for work, reason in refused:
-            work.answer.set_exception(reason)
-        for work, answer in answers:
-            work.answer.set_result(answer)
+        for piece, answer in answers:
+            if isinstance(answer, Exception):
+                piece.answer.set_exception(answer)
+            else:
+                piece.answer.set_result(answer)
         for listener in self.listeners:
             listener()
 
@@ -285,15 +305,7 @@ class Store:
 
     def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
-
-        def effect(t: Transaction) -> Job:
-            if (known := _known(t, key)) is not None:
-                return _job(t.connection, known)
-            (row,) = _insert(t, [job])
-            _remember(t, key, row.id)
-            return row
-
-        return self.write(effect)
+        return self._put(_Submission(job, key, Future()))
 
     def submit_sweep(
         self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
@@ -325,17 +337,15 @@ class Store:
         """Give queued jobs (by seq) their cores. One that is not queued any more is left out."""
 
         def effect(t: Transaction) -> list[Job]:
-            claimed = []
-            for seq, cores in choices:
-                job = _by_seq(t.connection, seq)
-                if job.state is not State.QUEUED:
-                    continue
-                now = time.time()
-                _move(t, job, Move.CLAIM, None, attempt=job.attempt + 1, started=job.started or now, ended=None)
-                row = {"job": seq, "number": job.attempt + 1, "cores": list(cores), "claimed": now}
-                t.run(attempts.insert(), [row])
-                t.note("attempt", **row)
-                claimed.append(_by_seq(t.connection, seq))
+            cores, now, claimed, rows = dict(choices), time.time(), list[Job](), list[dict[str, Any]]()
+            chosen = sa.select(jobs).where(jobs.c.seq.in_(cores), jobs.c.state == State.QUEUED)
+            for job in map(_record, t.run(chosen).all()):
+                number, started = job.attempt + 1, job.started or now
+                claimed.append(_move(t, job, Move.CLAIM, None, attempt=number, started=started, ended=None))
+                rows.append({"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now})
+                t.note("attempt", **rows[-1])
+            if rows:
+                t.run(attempts.insert(), rows)
             return claimed
 
         return self.write(effect)
@@ -473,14 +483,20 @@ class Store:
             return [_record(row) for row in connection.execute(query if where is None else query.where(where))]
 
     def page(
-        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int, value: sa.ColumnElement[Any] | None
-    ) -> list[tuple[Job, Any]]:
+        self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int,
+        value: sa.ColumnElement[Any] | None = None, indexed: bool = False,
+    ) -> list[tuple[Job, Any]]:  # fmt: skip
         """Jobs that fit, in order, each with the value it is ordered by.
 
-        The jobs are chosen first and read afterwards: sorting moves numbers, not cases.
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `indexed`: an index has what
+        the filter needs, but not in this order; so where few jobs fit they are found by it and sorted, and where many
+        do, a walk along the order meets enough of them soon.
         """
-        chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
         with self.reading() as connection:
+            if indexed:
+                few = connection.execute(sa.select(jobs.c.seq).where(where).limit(FEW + 1)).scalars().all()
+                where = jobs.c.seq.in_(few) if len(few) <= FEW else where
+            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
             places = connection.execute(chosen.order_by(*order).limit(limit)).all()
             rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
             found = {row.seq: _record(row) for row in rows}
@@ -729,7 +745,7 @@ def _move(t: Transaction, job: Job, move: Move, message: str | None, **values: A
     state, now = after(job.state, move), time.time()
     _set(t, job, event=now, state=state, message=message, **values)
     t.run(events.insert(), [{"job": job.seq, "at": now, "state": state, "message": message}])
-    return _by_seq(t.connection, job.seq)
+    return replace(job, state=state, message=message, **values)
 
 
 def _set(t: Transaction, job: Job, event: float | None = None, **values: Any) -> None:
@@ -748,6 +764,59 @@ def _retry(t: Transaction, job: Job) -> Job:
     """A new life: what broke before does not count."""
     t.durable = True
     return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None)
+
+
+def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReusedError]:
+    """Queue all that no key has brought before: a few statements, however many there are."""
+    texts = {f"{key.scope} {key.value}" for submission in wanted if (key := submission.key) is not None}
+    query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
+    # by key: the fingerprint of its request, and the job's id or its place among the new ones
+    seen: dict[str, tuple[str, str | int]] = {}
+    if texts:
+        seen = {row.key: (row.fingerprint, row.resource) for row in t.run(query)}
+    new: list[NewJob] = []
+    places: list[str | int | KeyReusedError] = []
+    for submission in wanted:
+        key = submission.key
+        text = "" if key is None else f"{key.scope} {key.value}"
+        fingerprint, place = seen.get(text, (None, None))
+        if key is not None and fingerprint is not None and fingerprint != key.fingerprint:
+            places.append(_reused(key))
+            continue
+        if place is None:
+            place = len(new)
+            new.append(submission.job)
+            if key is not None:
+                seen[text] = key.fingerprint, place
+        places.append(place)
+    made = _insert(t, new)
+    rows = [
+        {"key": text, "fingerprint": fingerprint, "resource": made[place].id, "created": time.time()}
+        for text, (fingerprint, place) in seen.items()
+        if isinstance(place, int)
+    ]
+    if rows:
+        t.run(idempotency.insert(), rows)
+    return [
+        place if isinstance(place, KeyReusedError) else made[place] if isinstance(place, int)
+        else _job(t.connection, place)
+        for place in places
+    ]  # fmt: skip
+
+
+def _pieces(batch: "Sequence[_Work | _Submission]") -> "list[_Piece]":
+    """What is done in a savepoint each: all submissions at once, everything else by itself."""
+    submissions = [work for work in batch if isinstance(work, _Submission)]
+    pieces: list[_Piece] = [([work], _alone(work)) for work in batch if isinstance(work, _Work)]
+    return [(submissions, lambda t: _submit(t, submissions)), *pieces] if submissions else pieces
+
+
+def _alone(work: _Work) -> "Callable[[Transaction], list[Any]]":
+    return lambda t: [work.effect(t)]
+
+
+def _reused(key: Key) -> KeyReusedError:
+    return KeyReusedError(f"Idempotency-Key {key.value!r}: came before, with another request")
 
 
 def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
@@ -846,7 +915,7 @@ def _known(t: Transaction, key: Key | None) -> str | None:
     if (row := t.run(query).first()) is None:
         return None
     if row.fingerprint != key.fingerprint:
-        raise KeyReusedError(f"Idempotency-Key {key.value!r}: came before, with another request")
+        raise _reused(key)
     return str(row.resource)
 
 

@@ -49,7 +49,7 @@ import sys, uvicorn
 from pathlib import Path
 from frit.service.app import create_app
 from frit.service.settings import Settings
-settings = Settings(data=Path(sys.argv[1]), cores=1, free_disk=0, poll=0.05)
+settings = Settings(data=Path(sys.argv[1]), cores=1, free_disk=int(sys.argv[3]), poll=0.05)
 uvicorn.run(create_app(settings), port=int(sys.argv[2]), log_level="warning", timeout_graceful_shutdown=1)
 """
 
@@ -90,14 +90,14 @@ def listening(folder: Path, **more: Any) -> Iterator[str]:
 class Process:
     """The service as a process of its own, on one port through all its lives."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.port = folder, free_port()
+    def __init__(self, folder: Path, free_disk: int = 0) -> None:
+        self.folder, self.port, self.free_disk = folder, free_port(), free_disk
         self.url = f"http://127.0.0.1:{self.port}"
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Until it is ready."""
-        command = [sys.executable, "-P", "-c", SERVER, str(self.folder), str(self.port)]
+        """Until it is ready, or says why not."""
+        command = [sys.executable, "-P", "-c", SERVER, str(self.folder), str(self.port), str(self.free_disk)]
         self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         until(self._ready)
 
@@ -105,7 +105,7 @@ class Process:
         assert self.process is not None  # started
         assert self.process.poll() is None, "the server has ended"
         try:
-            return httpx2.get(f"{self.url}/readyz").status_code == 200
+            return httpx2.get(f"{self.url}/readyz").status_code in (200, 503)
         except httpx2.TransportError:
             return False
 

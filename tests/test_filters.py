@@ -68,7 +68,7 @@ def found(store: Store, **query: str) -> list[Job]:
     while True:
         selection = filters.select([*given, *place], lambda name: store.sweep(name).seq)
         value = None if selection.scalar is None else selection.scalar.sql
-        page = store.page(selection.where, selection.order, selection.limit + 1, value)
+        page = store.page(selection.where, selection.order, selection.limit + 1, value, selection.indexed)
         rows += [job for job, _ in page[:7]]
         if len(page) <= 7:
             return rows
@@ -240,17 +240,27 @@ def test_no_cursor_breaks_the_query(text: str) -> None:
 def plan(store: Store, *parameters: tuple[str, str]) -> str:
     """How SQLite goes about choosing the page."""
     selection = filters.select(parameters, lambda name: 1)
-    query = sa.select(jobs.c.seq).where(selection.where).order_by(*selection.order).limit(51)
+    query = sa.select(jobs.c.seq).where(selection.where).limit(51)
+    query = query if selection.indexed else query.order_by(*selection.order)
     text = str(query.compile(dialect=sa.create_engine("sqlite://").dialect, compile_kwargs={"literal_binds": True}))
     with store.reading() as connection:
         return " / ".join(row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}"))
 
 
-@pytest.mark.parametrize("key", ["mean_radius", "std_radius", "packing_density"])
-def test_what_sweeps_are_made_of_is_found_by_an_index(store: Store, key: str) -> None:
-    assert f"USING INDEX ix_jobs_{key}" in plan(store, (f"particles.{key}.ge", "9"))
-    assert f"USING INDEX ix_jobs_{key}" in plan(store, ("order", f"-particles.{key}"))
-    assert "TEMP B-TREE" not in plan(store, ("order", f"-particles.{key}"))
+@pytest.mark.parametrize("key", filters.INDEXED)
+def test_what_sweeps_are_made_of_and_lead_to_is_found_by_an_index(store: Store, key: str) -> None:
+    index = f"USING INDEX ix_jobs_{key.rpartition('.')[2]}"
+    assert f"SEARCH jobs {index}" in plan(store, (f"{key}.ge", "0.9"), ("state", "succeeded"))
+    assert f"SEARCH jobs {index}" in plan(store, (key, "0.9"))
+    assert index in plan(store, ("order", f"-{key}"))
+    assert "TEMP B-TREE" not in plan(store, ("order", f"-{key}"), ("state", "succeeded"))
+
+
+def test_few_and_many_jobs_that_fit_are_found_alike(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = {"particles.mean_radius.ge": "9"}
+    few = [job.seq for job in found(store, **query)]
+    monkeypatch.setattr("frit.service.store.FEW", 3)
+    assert [job.seq for job in found(store, **query)] == few
 
 
 def test_a_state_is_found_by_an_index_in_the_order_of_the_page(store: Store) -> None:

@@ -1,0 +1,148 @@
+"""What the service bears, printed and not asserted: `python tests/benchmarks/bench_service.py [NAME ...]`."""
+
+import http.client
+import json
+import multiprocessing
+import random
+import sqlite3
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from asking import PACKING, Process
+
+from frit.service.jobs import Job, NewJob
+from frit.service.store import Store
+from frit.solver.case import parse_case
+from frit.solver.variations import case_text, identity, written
+
+JOBS = 100_000
+POSTS, CONNECTIONS = 5000, 32
+TREE = parse_case(PACKING)
+TEXTS = {name: written(table) for name, table in TREE.tables().items()}
+
+
+def new_job(number: int, dice: random.Random) -> NewJob:
+    """Of a packing whose mean radius is anything from 8 to 12 nm; the identity is made up."""
+    text = case_text("pack", TEXTS).replace('"mean_radius": 8.0', f'"mean_radius": {8 + 4 * dice.random()}')
+    made_up = f"{number:016x}{identity(TEXTS)[16:]}"
+    return NewJob(text, made_up, f"pack {number}", priority=dice.randrange(3))
+
+
+# --- submissions ------------------------------------------------------------------------------------------
+
+
+def load(port: int, posts: int, connections: int, answers: Any) -> None:
+    """In a process of its own: that many POSTs over that many kept connections, one at a time on each."""
+    import asyncio
+
+    async def one(count: int, body: bytes) -> list[float]:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        lines = ("Host: 127.0.0.1", "Content-Type: application/json", f"Content-Length: {len(body)}", "", "")
+        head = "\r\n".join(("POST /v1/jobs HTTP/1.1", *lines))
+        times = []
+        for _ in range(count):
+            start = time.perf_counter()
+            writer.write(head.encode() + body)
+            answer = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+            await reader.readexactly(int(answer.partition("content-length: ")[2].partition("\r\n")[0]))
+            assert answer.startswith("http/1.1 201"), answer
+            times.append(time.perf_counter() - start)
+        writer.close()
+        return times
+
+    async def all_of_them() -> list[float]:
+        body = json.dumps({"case": PACKING}).encode()
+        found = await asyncio.gather(*(one(posts // connections, body) for _ in range(connections)))
+        return [seconds for times in found for seconds in times]
+
+    start = time.perf_counter()
+    times = sorted(asyncio.run(all_of_them()))
+    answers.put((len(times) / (time.perf_counter() - start), times))
+
+
+def submissions() -> None:
+    """POST /v1/jobs per second on one worker."""
+    with tempfile.TemporaryDirectory() as folder:
+        server = Process(Path(folder), free_disk=1 << 62)
+        server.start()
+        try:
+            for _ in range(2):
+                answers: Any = multiprocessing.Queue()
+                sender = multiprocessing.Process(target=load, args=(server.port, POSTS, CONNECTIONS, answers))
+                sender.start()
+                rate, times = answers.get()
+                sender.join()
+                print(f"POST /v1/jobs: {rate:.0f} per second; half within {times[len(times) // 2] * 1e3:.1f} ms,"
+                      f" 99 % within {times[len(times) * 99 // 100] * 1e3:.1f} ms")  # fmt: skip
+        finally:
+            server.end()
+
+
+# --- pages ------------------------------------------------------------------------------------------------
+
+
+def filled(folder: Path) -> None:
+    """An index of many jobs, nine in ten of them ended with a result."""
+    dice, store, start = random.Random(2), Store(folder), time.perf_counter()
+    made: list[Future[Job]] = [store.submit(new_job(number, dice)) for number in range(JOBS)]
+    wait(made)
+    print(f"{JOBS} jobs stored in {time.perf_counter() - start:.1f} s")
+    store.close()
+    with closing(sqlite3.connect(folder / "frit.db")) as connection, connection:
+        rows = [
+            (json.dumps({"time": 1.0, "vacancy_ratio": dice.random(), "free_energy": 840.0, "wall_time": 3.0}), seq + 1)
+            for seq in range(JOBS) if seq % 10
+        ]  # fmt: skip
+        connection.executemany("UPDATE jobs SET state = 'succeeded', result = ? WHERE seq = ?", rows)
+
+
+def pages() -> None:
+    """GET /v1/jobs: a page of 50 of 100 000 jobs, over HTTP."""
+    queries = {
+        "plain": "", "state": "state=queued", "many by radius": "particles.mean_radius.ge=9",
+        "few by radius": "particles.mean_radius.ge=11.999", "many by result": "result.vacancy_ratio.le=0.5",
+        "few by result": "result.vacancy_ratio.le=0.0005",
+        "state and result": "state=succeeded&result.vacancy_ratio.le=0.01",
+        "order by result": "order=result.vacancy_ratio&state=succeeded",
+        "order by radius": "order=-particles.mean_radius",
+        "order by name": "order=name", "tag nobody has": "tag=x", "key without index": "model.k=3",
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        filled(Path(folder))
+        server = Process(Path(folder), free_disk=1 << 62)
+        server.start()
+        try:
+            with closing(http.client.HTTPConnection("127.0.0.1", server.port)) as connection:
+                for name, query in queries.items():
+                    times, found = asked(connection, f"/v1/jobs?{query}")
+                    middle, worst = times[len(times) // 2] * 1e3, times[-1] * 1e3
+                    print(f"page of {found:2d}, {name:18}{middle:8.1f} ms (worst {worst:.1f})")
+        finally:
+            server.end()
+
+
+def asked(connection: http.client.HTTPConnection, path: str) -> tuple[list[float], int]:
+    """Sorted times of the same question asked eleven times, and the jobs on the page."""
+    times, found = [], 0
+    for _ in range(11):
+        start = time.perf_counter()
+        connection.request("GET", path)
+        body = connection.getresponse().read()
+        times.append(time.perf_counter() - start)
+        found = len(json.loads(body)["jobs"])
+    return sorted(times), found
+
+
+BENCHES: dict[str, Callable[[], None]] = {"submissions": submissions, "pages": pages}
+
+if __name__ == "__main__":
+    for name in sys.argv[1:] or BENCHES:
+        BENCHES[name]()

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
 from indexing import LIMIT, done, is_whole, new, points, rows
 
 from frit.service.jobs import Exit, Move, TransitionError
 from frit.service.reindex import rebuild
 from frit.service.store import Store
 
-NUMBERS = st.integers(0, 5)
+NUMBERS = st.integers(0, 4)
 ENDS = {
     "succeed": "succeeded", "fail": "failed", "time_out": "timed_out", "stop": "cancelled", "release": "queued",
     "break": "error", "lose": "lost",
@@ -60,8 +60,15 @@ class Index(RuleBasedStateMachine):
         self.jobs[identifier] = Model(number)
         return identifier
 
+    @initialize(target=ids)
+    def begin(self) -> Any:
+        return multiple(*(self.submit_number(number) for number in range(3)))
+
     @rule(target=ids, number=NUMBERS)
     def submit(self, number: int) -> str:
+        return self.submit_number(number)
+
+    def submit_number(self, number: int) -> str:
         expected = self.add(number)
         assert done(self.store.submit(new(number))).id == expected
         return expected
@@ -88,6 +95,14 @@ class Index(RuleBasedStateMachine):
         assert bool(claimed) == (job.state == "queued")
         if claimed:
             job.go("starting", attempt=job.attempt + 1)
+
+    @rule(one=ids, moves=st.lists(st.sampled_from(sorted(ENDS)), min_size=1, max_size=4))
+    def whole_attempts(self, one: str, moves: list[str]) -> None:
+        for move in moves:
+            self.requeue(one, 0)
+            self.claim(one)
+            self.start(one, 0)
+            self.finish(one, move, 0)
 
     @rule(one=ids, late=st.sampled_from([0, 0, 0, 1]))
     def start(self, one: str, late: int) -> None:
@@ -181,5 +196,6 @@ def _empty(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 TestIndex = Index.TestCase
 TestIndex.settings = settings(
-    max_examples=12, stateful_step_count=40, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
+    max_examples=10, stateful_step_count=25, deadline=None, suppress_health_check=[HealthCheck.too_slow],
+    phases=[Phase.generate],  # each step flushes the disk: a failure is shown as it was found
+)  # fmt: skip

@@ -103,6 +103,7 @@ async def follow(engine: Any, sweep: str) -> bool:
     stop = asyncio.Event()
     with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live, stopping(stop):
         while True:
+            seen = engine.hub.count
             points = engine.store.sweep_points(sweep)
             if live.console.is_terminal:
                 live.update(lines(points, engine.progress, stop.is_set()), refresh=True)
@@ -112,7 +113,7 @@ async def follow(engine: Any, sweep: str) -> bool:
                 releasing = asyncio.create_task(engine.scheduler.release())
                 await releasing
                 return True
-            await engine.hub.wait(1.0)
+            await engine.hub.wait(1.0, seen)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ class Hub:
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
+        self.count = 0  # of notifications
 
     def notify(self) -> None:
         """Something has happened."""
@@ -17,11 +18,17 @@ class Hub:
             self._loop.call_soon_threadsafe(self._wake)
 
     def _wake(self) -> None:
+        self.count += 1
         self._changed.set()
         self._changed = asyncio.Event()
 
-    async def wait(self, seconds: float) -> bool:
-        """Until the next notification; False where none comes in that time."""
+    async def wait(self, seconds: float, seen: int | None = None) -> bool:
+        """Until the next notification; False where none comes in that time.
+
+        seen: the count before a look at things; what has come since counts as the next.
+        """
+        if seen is not None and seen != self.count:
+            return True
         try:
             await asyncio.wait_for(self._changed.wait(), seconds)
         except TimeoutError:

@@ -80,6 +80,7 @@ class Scheduler:
         """Tick when something has happened, and once in a while; trouble with the index passes or is shown."""
         self._spawn(self._follow())
         while True:
+            seen = self.hub.count
             try:
                 await self.tick()
                 self.trouble = self._disk()
@@ -88,7 +89,7 @@ class Scheduler:
             except Exception as error:  # not foreseen: the next tick may go better, and all running jobs depend on it
                 logger.exception("a tick has failed")
                 self.trouble = f"{type(error).__name__}: {error}"
-            await self.hub.wait(TICK)
+            await self.hub.wait(TICK, seen)
 
     async def tick(self) -> None:
         """Give free cores to the jobs whose turn it is: one query, and one transaction if there are any."""
@@ -160,7 +161,10 @@ class Scheduler:
             pid = await asyncio.shield(birth)
         except (BackendError, OSError) as error:
             logger.warning("job %s: %s", job.id, error)
-            return await self._end(job, cores, Exit(job.attempt, Move.BREAK, str(error), time.time()))
+            record = await self.backend.recorded(directory, job.attempt) if directory.is_dir() else None
+            if record is None:
+                return await self._end(job, cores, Exit(job.attempt, Move.BREAK, str(error), time.time()))
+            pid = int(record["pid"])  # it was forked all the same: only the answer was lost
         if (started := start_of(pid)) is not None:
             await self._started(job, pid, started, boot())
         await self._watch(job, cores)

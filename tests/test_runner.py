@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import psutil
 import pytest
@@ -313,6 +314,25 @@ def test_one_runner_per_run_directory_and_a_nursery_that_may_die(tmp_path: Path)
             assert end.move is Move.STOP
             assert read_exit(directory, 2) is None
         backend.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.usefixtures("standing_in")
+def test_a_runner_whose_birth_was_not_told_is_watched(tmp_path: Path) -> None:
+    """The nursery is killed after the fork and before its answer."""
+
+    async def main() -> None:
+        async with Engine(settings(tmp_path / "data", attempts=1)) as engine:
+            fork = engine.scheduler.backend._fork
+
+            async def mute(order: Order, lock: int) -> int:
+                await fork(order, lock)
+                raise EOFError("it has died")
+
+            with patch.object(engine.scheduler.backend, "_fork", mute):
+                (job,) = await ended(engine, *await submit(engine, new_job("sleep 0.2")))
+            assert (job.state, job.attempt) == (State.SUCCEEDED, 1)
 
     asyncio.run(main())
 

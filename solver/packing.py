@@ -158,9 +158,9 @@ def _pour(wanted: Request, count: int) -> Packing:
 class Trials:
     """What trials have shown: the fraction in the measured box over that of the container, and between which counts."""
 
-    def __init__(self, per_particle: float) -> None:
-        """per_particle: the part of the container that a mean particle fills."""
-        self.per_particle = per_particle
+    def __init__(self, per_particle: float, guess: float = 1.0) -> None:
+        """per_particle: the part of the container that a mean particle fills; guess: of the first ratio."""
+        self.per_particle, self.guess = per_particle, guess
         self.ratios: list[float] = []
         self.fractions: list[float] = []
         self.jams: list[float] = []  # counts with which heaps would have jammed at the height of the container
@@ -178,7 +178,7 @@ class Trials:
 
     def count(self, fraction: float) -> int:
         """To try next for this fraction in the measured box, from the latest trials."""
-        ratio = float(np.mean(self.ratios[-6:])) if self.ratios else 1.0
+        ratio = float(np.mean(self.ratios[-6:])) if self.ratios else self.guess
         return max(int(min(fraction / (self.per_particle * ratio) + 0.5, self.ceiling)), self.floor)
 
     def hopeless(self, fraction: float, tolerance: float) -> bool:
@@ -192,7 +192,7 @@ def _to_density(wanted: Request, count: int, density: float) -> Packing:
 
     Where all of the container is measured, whole particles may not come that near: then the nearest count will do.
     """
-    seen = Trials(density / count)
+    seen = Trials(density / count, _wall_effect(wanted) if wanted.box else 1.0)
     tolerance = max(TOLERANCE, 0.51 * seen.per_particle if wanted.box is None else 0.0)
     for trial in range(_trials(count)):
         n = seen.count(density)
@@ -205,6 +205,15 @@ def _to_density(wanted: Request, count: int, density: float) -> Packing:
         if seen.hopeless(density, tolerance):
             break
     raise _unreachable(wanted, count, seen)
+
+
+def _wall_effect(wanted: Request) -> float:
+    """About by how much the middle of a container is denser than all of it: next to a wall there is room to spare.
+
+    1 + 0.35 R A / V with A the area of the walls; 0.3 was seen in dense packs, 0.5 in loose ones.
+    """
+    radius = float(wanted.radii(SAMPLE, np.random.default_rng(0)).mean())
+    return 1.0 + 0.35 * radius * float((2.0 / wanted.size).sum())
 
 
 def _trials(count: int) -> int:

@@ -143,7 +143,8 @@ def handle_problems(app: FastAPI, routes: Sequence[BaseRoute]) -> None:
         problem = as_problem(error)
         if problem.details.status == 405:  # a route knows only its own method
             fitting = [r for r in routes if isinstance(r, APIRoute) and r.path_regex.match(request.url.path)]
-            problem.headers["Allow"] = ", ".join(sorted({method for route in fitting for method in route.methods or ()}))
+            methods = {method for route in fitting for method in route.methods or ()}
+            problem.headers["Allow"] = ", ".join(sorted(methods))
         return problem.response()
 
     kinds = (HttpError, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError)

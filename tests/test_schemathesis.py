@@ -1,5 +1,6 @@
 """The interface keeps what its own document says, whatever is sent: generated requests against the real service."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,21 +61,16 @@ def map_query(context: Any, query: Any) -> Any:
     return query
 
 
-@schema.hook
-def map_headers(context: Any, headers: Any) -> Any:
-    """A key of an earlier request would be refused with this one."""
-    if headers and "Idempotency-Key" in headers:
-        return {**headers, "Idempotency-Key": str(uuid4())}
-    return headers
-
-
 @schema.parametrize()
 @settings(
-    max_examples=20, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate],
+    max_examples=10, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate],
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 def test_every_answer_is_one_that_the_document_has(case: schemathesis.Case, url: str) -> None:
     # not ready is an answer, and nothing is started here
     excluded = [not_a_server_error] if case.operation.path == "/readyz" else []
     headers = {"Authorization": f"Bearer {Known.secret}"}
+    key = str((case.headers or {}).get("Idempotency-Key", ""))
+    if re.fullmatch("[!-~]{1,255}", key):  # one of an earlier request would be refused with this one
+        headers["Idempotency-Key"] = str(uuid4())
     case.call_and_validate(base_url=url, headers=headers, excluded_checks=excluded)

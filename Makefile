@@ -1,4 +1,5 @@
-# make run    set up everything and sinter the example pack, with a picture
+# make run    set up everything, sinter the three packs of sweeps/quick.toml, end with a table and their curves
+# make pack   the same with one pack on 2 ranks, with pictures
 # make test   set up everything and run the tests       (make slow: the long ones; make lint; make bench)
 
 PYTHON ?= python3
@@ -7,14 +8,21 @@ BIN := $(VENV)/bin
 RANKS ?= 2
 CASE ?= sweeps/cases/pack.toml
 OUT ?= runs/$(basename $(notdir $(CASE)))
+SWEEP ?= sweeps/quick.toml
+DATA ?= runs/data
 
 # Installed as a strict editable package: a new or removed file asks for a new install, an edited one does not.
 FILES := $(sort $(shell find solver service sweeps -name '*.py'))
 LISTED := $(VENV)/.files-$(shell echo "$(FILES)" | cksum | cut -d' ' -f1)
 
-.PHONY: run test slow lint bench setup clean
+.PHONY: run pack test slow lint bench setup clean
 
 run: setup
+	$(BIN)/frit sweep plan $(SWEEP) --data $(DATA)
+	$(BIN)/frit sweep run $(SWEEP) --data $(DATA)
+	$(BIN)/frit compare "$$(sed -n 's/^name = "\(.*\)"/\1/p' $(SWEEP) | head -n 1)" --data $(DATA) --out $(DATA)/curves.png
+
+pack: setup
 	@if [ -e "$(OUT)/run.json" ]; then \
 	  case "$$(sed -n 's/.*"state": "\([a-z]*\)".*/\1/p' "$(OUT)/run.json")" in \
 	    done) echo "$(OUT) is done already; make clean removes it" ;; \

@@ -14,6 +14,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel
 
 from . import admission, delivery, filters, metrics, openapi, stream, views
+from .comparison import ObservableError, compare
 from .engine import Engine
 from .jobs import SENTENCES, Job
 from .problems import WrongField, handle_problems, refused, unavailable
@@ -306,34 +307,11 @@ async def compare_jobs(
     observable: Annotated[str, Query(max_length=100, description="A scalar of the history rows.")] = "vacancy_ratio",
 ) -> views.Comparison:  # fmt: skip
     """An observable of all jobs over time, with the parameters that differ."""
-    return await asyncio.to_thread(compare, engine, sweep, observable)
-
-
-def compare(engine: Engine, sweep: SweepRecord, observable: str) -> views.Comparison:
-    """Curves in the order of the sweep; jobs without history have empty ones."""
-    store = engine.store
-    allowed = sorted({*filters.RESULTS, *store.observables(sweep.seq)} - {"time"})
-    if observable not in allowed:
-        wrong = WrongField(parameter="observable", value=observable, detail=f"must be one of {', '.join(allowed)}")
-        raise refused("refused-query", "The query is refused", [wrong])
-    points, curves = store.sweep_points(sweep.id), store.curves(sweep.seq, observable)
-    values: dict[str, set[str]] = {}
-    for point in points:
-        for name, value in point.parameters.items():
-            values.setdefault(name, set()).add(json.dumps(value))
-    differing = [name for name, found in values.items() if len(found) > 1]
-    shown = []
-    for point in points:
-        curve = curves.get(point.job.seq, [])
-        shown.append(
-            views.Curve(
-                job=point.job.id, name=point.name, state=point.job.state,
-                parameters={name: point.parameters.get(name) for name in differing},
-                time=[time for time, _ in curve], values=[value for _, value in curve],
-                final=curve[-1][1] if curve else None,
-            )
-        )  # fmt: skip
-    return views.Comparison(sweep=sweep.id, observable=observable, differing=differing, curves=shown)
+    try:
+        return await asyncio.to_thread(compare, engine.store, sweep, observable)
+    except ObservableError as error:
+        wrong = WrongField(parameter="observable", value=observable, detail=str(error))
+        raise refused("refused-query", "The query is refused", [wrong]) from None
 
 
 # --- the service ------------------------------------------------------------------------------------------

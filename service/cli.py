@@ -6,6 +6,7 @@ What a command imports beyond the terminal is imported inside it: `frit --help` 
 
 import json
 import math
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -19,9 +20,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from . import commands_sweep
+from . import commands_index, commands_server, commands_sweep, commands_token
 from .launch import Launch, LaunchError, Outcome, read_record
-from .words import cell, in_words, refuse
+from .words import AsJson, cell, in_words, refuse
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
@@ -33,7 +34,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(commands_index.db, name="db")
+app.command()(commands_index.reindex)
 app.add_typer(commands_sweep.app, name="sweep")
+app.add_typer(commands_token.app, name="token")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -45,7 +49,6 @@ def at_least_one(ranks: int | None) -> int | None:
 
 CaseFile = Annotated[Path, typer.Argument(metavar="CASE.toml", exists=True, dir_okay=False, help="Or JSON.")]
 Ranks = Annotated[int, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False)]
 
 
@@ -136,6 +139,37 @@ def plot(
             typer.echo(f"{out}: snapshot at t = {time:g}")
     except (ValueError, OSError) as error:
         refuse(str(error))
+
+
+commands_server.add_to(app)
+
+
+@app.command("pack")
+def pack_only(
+    case: CaseFile,
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", dir_okay=False, help="Particles: x,y[,z],radius, nm.")],
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: beside the CSV; .pdf, .svg too.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the packing only: a CSV, a picture, and what it is like."""
+    from . import pack
+
+    check_case(case)
+    try:
+        report = pack.pack(case, out, dict(os.environ))
+        picture = picture or out.with_suffix(".png")
+        pack.draw(out, report, f"{case.stem}: {report['packing']['count']} particles", picture)
+    except (ValueError, OSError) as error:
+        refuse(str(error))
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+        return
+    console = Console(highlight=False)
+    for table in pack.tables(report):
+        console.print(table, "")
+    typer.echo(f"{out}, {picture}")
 
 
 @app.command()

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,12 +13,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from .words import SweepFile, cell, in_words, refuse
+from .words import AsJson, DataFolder, SweepFile, in_words, refuse, show_table
 
 app = typer.Typer(no_args_is_help=True, help="Sweeps over packings: what they cost, and running them without a server.")
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
-DataFolder = Annotated[Path, typer.Option("--data", metavar="DIR", file_okay=False, help="Data folder.")]
 WIDEST = 44  # characters of a name in a table
 
 
@@ -58,8 +56,7 @@ def run(
     from .settings import Settings
 
     sweep, expansion = expanded(file)
-    given = {} if cores is None else {"cores": cores}
-    settings = Settings(data=data, **given)
+    settings = Settings(data=data) if cores is None else Settings(data=data, cores=cores)
     if sweep.ranks > settings.cores:
         refuse(f"{file}: ranks = {sweep.ranks}: must be at most the {settings.cores} cores that there are (--cores)")
     try:
@@ -69,7 +66,7 @@ def run(
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
-        show(rows)
+        show_table(rows)
         typer.echo(f"run directories: {settings.runs}/")
         if status == 130:
             typer.echo("interrupted; the same command goes on", err=True)
@@ -164,14 +161,3 @@ def rows_of(store: Any, sweep: str) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def show(rows: list[Mapping[str, Any]] | list[dict[str, Any]]) -> None:
-    """Rows as a table; columns in which nobody has anything are left out."""
-    keys = [key for key in (rows[0] if rows else {}) if any(row.get(key) is not None for row in rows)]
-    table = Table(box=None, pad_edge=False)
-    for key in keys:
-        table.add_column(key.replace("_", " "), overflow="fold")
-    for row in rows:
-        table.add_row(*(cell(row.get(key)) for key in keys))
-    Console(width=None).print(table)

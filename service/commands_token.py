@@ -3,21 +3,21 @@
 import json
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
+from .words import AsJson, DataFolder, refuse
+
 app = typer.Typer(name="token", help="Access tokens of a data folder; they count at once.", no_args_is_help=True)
 
-Data = Annotated[Path, typer.Option("--data", metavar="DIR", file_okay=False, envvar="FRIT_DATA", help="Data folder.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()
 def create(
     name: Annotated[str, typer.Option("--name", metavar="NAME", help="Whose it is.")],
     scope: Annotated[str, typer.Option("--scope", metavar="SCOPE", help="read, submit (also cancel) or admin.")],
-    data: Data = Path("data"),
+    data: DataFolder = Path("data"),
     as_json: AsJson = False,
 ) -> None:
     """Make a token and print it: it cannot be shown again."""
@@ -33,7 +33,7 @@ def create(
 
 @app.command()
 def revoke(
-    name: Annotated[str, typer.Argument(metavar="NAME")], data: Data = Path("data"), as_json: AsJson = False
+    name: Annotated[str, typer.Argument(metavar="NAME")], data: DataFolder = Path("data"), as_json: AsJson = False
 ) -> None:
     """Let a token count no more, from now on."""
     from . import tokens
@@ -47,7 +47,7 @@ def revoke(
 
 
 @app.command(name="list")
-def show(data: Data = Path("data"), as_json: AsJson = False) -> None:
+def show(data: DataFolder = Path("data"), as_json: AsJson = False) -> None:
     """List the tokens, never their secrets."""
     from . import tokens
     from .store import StoreError
@@ -70,9 +70,3 @@ def show(data: Data = Path("data"), as_json: AsJson = False) -> None:
 def day(seconds: float | None) -> str | None:
     """Seconds since 1970 as ISO 8601."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
-
-
-def refuse(text: str) -> NoReturn:
-    """Say on stderr what is wrong, and leave with 2."""
-    typer.echo(text, err=True)
-    raise typer.Exit(2)

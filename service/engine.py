@@ -14,6 +14,7 @@ from .jobs import Job, NewJob
 from .migrations import IndexVersionError
 from .results import Follower
 from .scheduler import Scheduler
+from .security import check_address
 from .settings import Settings
 from .store import Key, NewPoint, Store, StoreError, SweepRecord
 
@@ -92,14 +93,28 @@ class Engine:
         return self.settings.runs / identifier
 
 
+def check(settings: Settings) -> None:
+    """Say early why a service cannot be started. Raises `EngineError`, `AddressError`."""
+    lock = take(settings.data)
+    try:
+        store = Store(settings.data)
+        try:
+            check_address(settings, store)
+        finally:
+            store.close()
+    except (IndexVersionError, StoreError) as error:
+        raise EngineError(str(error)) from error
+    finally:
+        os.close(lock)
+
+
 def take(data: Path) -> int:
     """Make the data folder and lock it for this process."""
     try:
         (data / "runs").mkdir(parents=True, exist_ok=True)
         lock = try_lock(data / "lock")
         if lock is not None:
-            os.ftruncate(lock, 0)
-            os.write(lock, f"{os.getpid()}\n".encode())
+            sign(lock)
     except OSError as error:
         reasons = {errno.EROFS: "it is read-only", errno.EACCES: "this user may not write there"}
         reason = reasons.get(error.errno or 0, error.strerror)
@@ -108,3 +123,13 @@ def take(data: Path) -> int:
         owner = (data / "lock").read_text().strip()
         raise EngineError(f"data = {data}: in use by process {owner}: one service per data folder")
     return lock
+
+
+def sign(lock: int) -> None:
+    """Write into the lock who holds it; where that fails, it is let go."""
+    try:
+        os.ftruncate(lock, 0)
+        os.write(lock, f"{os.getpid()}\n".encode())
+    except OSError:
+        os.close(lock)
+        raise

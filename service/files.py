@@ -23,11 +23,16 @@ def write_json(path: Path, tree: Any, durable: bool = True) -> None:
             beside.unlink()
         raise
     if durable:
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        flush_folder(path.parent)
+
+
+def flush_folder(folder: Path) -> None:
+    """Make new names in it durable."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Wakes whoever waits for something to happen: a commit of the index, a line of progress, the end of a runner."""
 
 import asyncio
+from contextlib import suppress
 
 
 class Hub:
@@ -12,7 +13,7 @@ class Hub:
 
     def notify(self) -> None:
         """Something has happened."""
-        if not self._loop.is_closed():
+        with suppress(RuntimeError):  # the loop has ended meanwhile: nobody waits any more
             self._loop.call_soon_threadsafe(self._wake)
 
     def _wake(self) -> None:

@@ -93,8 +93,11 @@ class TransitionError(ValueError):
 
     def __init__(self, state: State, move: Move) -> None:
         self.state, self.move = state, move
-        allowed = ", ".join(before for before, m in TRANSITIONS if m == move)
-        super().__init__(f"state = {state!r}: {move} is possible only from {allowed}")
+        allowed = [before for before, m in TRANSITIONS if m == move]
+        if move is Move.CANCEL:  # the end of a job that has cores is a wish first, and a move once it is obeyed
+            allowed += [before for before in State if before.active]
+        words = ", ".join(before for before in allowed if before is not state)
+        super().__init__(f"state = '{state}': {move} is possible only from {words}")
 
 
 def after(state: State, move: Move) -> State:

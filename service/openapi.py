@@ -106,7 +106,7 @@ def _filters() -> dict[str, Any]:
         ("state", states, "Jobs in one of these states."),
         ("sweep", {"type": "string"}, "Jobs of a sweep, by its id or name."),
         ("tag", {"type": "string"}, "Jobs with a tag."),
-        ("order", {"type": "string", "pattern": orders, "default": "-created"}, "A key; - before it: the largest first."),
+        ("order", {"type": "string", "pattern": orders, "default": "-created"}, "A key; -: the largest first."),
         ("limit", {"type": "integer", "minimum": 1, "maximum": filters.LARGEST_PAGE}, "Jobs on the page."),
         ("cursor", {"type": "string"}, "From `next` of the page before."),
     ]

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,7 @@ class Reader:
         self.directory, self.place = directory, Place()
         self._case = case
         self._times: tuple[float, ...] | None = None
+        self.sound = True  # False: what it wrote cannot be read
         self._file = -1  # inode: a resumed run replaces the history by a new file
 
     def news(self) -> tuple[list[tuple[int, str]], list[tuple[int, float]]]:
@@ -40,10 +43,9 @@ class Reader:
         place = self.place
         try:
             with open(self.directory / "history.jsonl", "rb") as file:
-                status = file.seek(0, 2), file.fileno()
-                inode = (self.directory / "history.jsonl").stat().st_ino
-                if inode != self._file or status[0] < place.size:
-                    self._file, place.rows, place.size = inode, 0, 0
+                status = os.fstat(file.fileno())  # of what was opened: the name may mean another file by now
+                if status.st_ino != self._file or status.st_size < place.size:
+                    self._file, place.rows, place.size = status.st_ino, 0, 0
                 file.seek(place.size)
                 added = file.read()
         except FileNotFoundError:
@@ -51,6 +53,8 @@ class Reader:
         whole = added[: added.rfind(b"\n") + 1]
         lines = whole.decode().splitlines()
         rows = list(enumerate(lines, place.rows))
+        for number, line in rows:
+            check_row(self.directory / "history.jsonl", number, line)
         place.rows, place.size = place.rows + len(lines), place.size + len(whole)
         return rows
 
@@ -70,10 +74,23 @@ class Reader:
     def result(self) -> dict[str, Any]:
         """The scalars of the last history row, and what a packing realised."""
         lines = (self.directory / "history.jsonl").read_bytes().split(b"\n") if self.place.rows else []
+        if len(lines) > 1:
+            check_row(self.directory / "history.jsonl", len(lines) - 2, lines[-2].decode())
         last: dict[str, Any] = json.loads(lines[-2]) if len(lines) > 1 else {}
         scalars = {key: value for key, value in last.items() if isinstance(value, int | float)}
         packing = read_json(self.directory / "run.json").get("packing")
         return {**scalars, **({"packing": packing} if packing else {})}
+
+
+def check_row(path: Path, number: int, line: str) -> None:
+    """Raise `ValueError` where a line is no row, as a crash of the machine can leave it."""
+    try:
+        row = json.loads(line, parse_constant=float)
+        sound = isinstance(row, dict) and math.isfinite(row["time"])
+    except (ValueError, LookupError, TypeError):
+        sound = False
+    if not sound:
+        raise ValueError(f"{path}: row {number} is damaged: {line[:80]!r}")
 
 
 class Follower:
@@ -95,8 +112,12 @@ class Follower:
     async def look(self, jobs: Mapping[str, int]) -> None:
         """Take in what these jobs (id: seq) have added."""
         for identifier, seq in jobs.items():
-            if (reader := self._readers.get(identifier)) is not None:
-                rows, snapshots = await asyncio.to_thread(reader.news)
+            if (reader := self._readers.get(identifier)) is not None and reader.sound:
+                try:
+                    rows, snapshots = await asyncio.to_thread(reader.news)
+                except ValueError:  # told at the end of the job; the others are not kept waiting
+                    reader.sound = False
+                    continue
                 progress = await asyncio.to_thread(read_json, self.runs / identifier / "progress.json")
                 if progress:
                     self._progress[identifier] = progress

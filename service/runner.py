@@ -233,7 +233,12 @@ def judge(outcome: Outcome, reason: str | None) -> tuple[Move, str | None]:
 def read_exit(directory: Path, attempt: int) -> Exit | None:
     """The exit record of an attempt, if it is there."""
     record = read_json(directory / "exit.json")
-    return Exit(**{**record, "move": Move(record["move"])}) if record.get("attempt") == attempt else None
+    if record.get("attempt") != attempt:
+        return None
+    try:
+        return Exit(**{**record, "move": Move(record["move"])})
+    except (LookupError, TypeError, ValueError):  # damaged: as good as none
+        return None
 
 
 def stamp(path: Path) -> tuple[int, int] | None:

@@ -59,6 +59,7 @@ class Scheduler:
         self.trouble: str | None = "starting up"
         self.open = True  # whether to start jobs
         self._tasks: set[asyncio.Task[None]] = set()
+        self._births: set[asyncio.Task[int]] = set()  # of runners
         self._first: tuple[int, float] | None = None  # the job that waits for cores, and since when
 
     # --- the loop -----------------------------------------------------------------------------------------
@@ -84,6 +85,9 @@ class Scheduler:
                 self.trouble = self._disk()
             except (StoreError, OSError) as error:
                 self._complain(str(error))
+            except Exception as error:  # not foreseen: the next tick may go better, and all running jobs depend on it
+                logger.exception("a tick has failed")
+                self.trouble = f"{type(error).__name__}: {error}"
             await self.hub.wait(TICK)
 
     async def tick(self) -> None:
@@ -115,7 +119,11 @@ class Scheduler:
         """Tell a job's runner to checkpoint and end; `reason` is one of runner.STOPS."""
         directory = self.settings.runs / job.id
         request = {"attempt": job.attempt, "stop": reason}
-        await asyncio.to_thread(write_json, directory / "request.json", request)
+        try:
+            await asyncio.to_thread(directory.mkdir, parents=True, exist_ok=True)  # its runner may be on the way up
+            await asyncio.to_thread(write_json, directory / "request.json", request)
+        except OSError as error:  # a full disk: it is released then, and the index knows what else was wanted
+            self._complain(f"job {job.id}: {error}")
         self.backend.tell(directory, job.attempt, signal.SIGTERM)
 
     async def release(self) -> None:
@@ -128,7 +136,9 @@ class Scheduler:
             await self.hub.wait(TICK)
 
     async def close(self) -> None:
-        """Leave; the runners go on."""
+        """Leave; the runners go on, those on the way up too."""
+        self.open = False
+        await asyncio.gather(*self._births, return_exceptions=True)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -144,14 +154,21 @@ class Scheduler:
         )  # fmt: skip
         self.follower.follow(job)
         try:
-            await asyncio.to_thread(make_directory, directory, job)
-            pid = await self.backend.start(order)
+            birth = asyncio.create_task(self._bear(job, order))
+            self._births.add(birth)
+            birth.add_done_callback(self._births.discard)
+            pid = await asyncio.shield(birth)
         except (BackendError, OSError) as error:
             logger.warning("job %s: %s", job.id, error)
             return await self._end(job, cores, Exit(job.attempt, Move.BREAK, str(error), time.time()))
         if (started := start_of(pid)) is not None:
             await self._started(job, pid, started, boot())
         await self._watch(job, cores)
+
+    async def _bear(self, job: Job, order: Order) -> int:
+        """Not to be cut short: a claimed job gets its runner."""
+        await asyncio.to_thread(make_directory, Path(order.directory), job)
+        return await self.backend.start(order)
 
     async def _started(self, job: Job, pid: int, pid_start: int, boot_id: str) -> None:
         recorded = await self._insist(lambda: self.store.start(job.id, job.attempt, pid, pid_start, boot_id))
@@ -161,10 +178,14 @@ class Scheduler:
                 await self.stop(recorded, "cancelled")
 
     async def _adopt(self, job: Job, cores: set[int]) -> None:
-        """Watch a runner that an earlier service has started."""
+        """Watch a runner that an earlier service has started, unless it did not come to that."""
         directory = self.settings.runs / job.id
-        if (record := await self.backend.recorded(directory, job.attempt)) is not None:
-            await self._started(job, record["pid"], record["pid_start"], record["boot"])
+        directory.mkdir(parents=True, exist_ok=True)
+        record = await self.backend.recorded(directory, job.attempt)
+        if record is None:
+            message = "the service ended before it had started a runner"
+            return await self._end(job, cores, Exit(job.attempt, Move.RELEASE, message, time.time()))
+        await self._started(job, record["pid"], record["pid_start"], record["boot"])
         await self._watch(job, cores)
 
     async def _watch(self, job: Job, cores: set[int]) -> None:
@@ -181,11 +202,12 @@ class Scheduler:
             try:
                 await self.follower.finish(job)
                 break
-            except (StoreError, OSError, ValueError) as error:
+            except (StoreError, OSError) as error:
                 self._complain(f"job {job.id}: {error}")
-                if isinstance(error, ValueError):  # a damaged file: the job has ended all the same
-                    break
                 await asyncio.sleep(AGAIN)
+            except Exception as error:  # a damaged file: the job has ended all the same
+                logger.warning("job %s: %s: %s", job.id, type(error).__name__, error)
+                break
         ended = await self._insist(lambda: self.store.finish(job.id, end, self.settings.attempts))
         self.running.pop(job.id, None)
         self.free |= cores
@@ -258,5 +280,6 @@ def make_directory(directory: Path, job: Job) -> None:
         beside = submitted.with_name("submitted.json.new")
         beside.write_text(job.case)
         os.replace(beside, submitted)
-    record = {key: getattr(job, key) for key in ("id", "name", "ranks", "priority", "tags", "time_limit", "created")}
+    keys = ("seq", "id", "identity", "name", "ranks", "priority", "tags", "time_limit", "created")
+    record = {key: getattr(job, key) for key in keys}
     write_json(directory / "job.json", record, durable=False)

@@ -1,6 +1,20 @@
 """The tables of the index. A change here needs a migration in migrations/versions; a test compares the two."""
 
-from sqlalchemy import JSON, Boolean, Column, Float, ForeignKey, Index, Integer, MetaData, String, Table, Text, text
+from sqlalchemy import (
+    JSON,
+    Boolean,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    Text,
+    func,
+    literal_column,
+)
 
 metadata = MetaData(
     naming_convention={
@@ -51,8 +65,9 @@ jobs = Table(
 Index("ix_jobs_queue", jobs.c.state, jobs.c.priority.desc(), jobs.c.seq)
 Index("ix_jobs_state_seq", jobs.c.state, jobs.c.seq)
 for key in ("mean_radius", "std_radius", "packing_density"):  # what sweeps are made of
-    Index(f"ix_jobs_{key}", text(f"""json_extract("case", '$.particles.{key}')"""))
-Index("ix_jobs_vacancy_ratio", text("json_extract(result, '$.vacancy_ratio')"))  # what they lead to
+    Index(f"ix_jobs_{key}", func.json_extract(jobs.c.case, literal_column(f"'$.particles.{key}'")))
+# ... and what they lead to
+Index("ix_jobs_vacancy_ratio", func.json_extract(jobs.c.result, literal_column("'$.vacancy_ratio'")))
 
 sweep_jobs = Table(
     "sweep_jobs",

@@ -13,8 +13,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -23,12 +23,19 @@ from sqlalchemy.engine import Connection, Engine, Row
 from sqlalchemy.exc import DBAPIError
 
 from . import migrations
+from .files import flush_folder
 from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
 FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
+SUCCEEDED = 1 << 60  # more than any seq
+TROUBLE = {  # primary codes of SQLite's that tell of the database and its disk, not of one statement
+    sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PROTOCOL,
+    sqlite3.SQLITE_NOTADB,
+}  # fmt: skip
 T = TypeVar("T")
 
 
@@ -128,14 +135,15 @@ class Transaction:
 
     connection: Connection
     lines: list[str] = field(default_factory=list)
+    durable: bool = False  # whether somebody is told of something that only the lines keep when the database is lost
 
     def run(self, statement: sa.Executable, rows: Any = None) -> sa.CursorResult[Any]:
         """Execute; `rows` for many at once."""
         return cast("sa.CursorResult[Any]", self.connection.execute(statement, rows))
 
-    def note(self, **line: Any) -> None:
+    def note(self, kind: str, **line: Any) -> None:
         """A line of the journal: what a lost index is rebuilt from."""
-        self.lines.append(json.dumps({**line, "at": time.time()}) + "\n")
+        self.lines.append(json.dumps({"kind": kind, **line}) + "\n")
 
 
 @dataclass
@@ -153,11 +161,14 @@ class _Submission:
     answer: Future[Any]
 
 
+_Piece = tuple[Sequence[_Work | _Submission], Callable[[Transaction], Sequence[Any]]]
+
+
 class Store:
     """The index of one data folder. Methods that change it give a future, done once the change is durable."""
 
     def __init__(self, folder: Path, writable: bool = True) -> None:
-        """Open an up-to-date index; make it where there is none. Raises `IndexVersionError`.
+        """Open an up-to-date index; make it where there is none. Raises `IndexVersionError`, `StoreError`.
 
         writable: False for a look beside the service that writes; there can be one writer only.
         """
@@ -166,11 +177,13 @@ class Store:
         migrations.prepare(self.path)
         self._writer = _engine(self.path, writer=True)
         self._reader = _engine(self.path, writer=False)
-        try:
-            self._writer.connect().close()  # from now on there is a write-ahead log, and it is this writer's
-        except DBAPIError as error:
-            raise StoreError(f"{self.path}: {error.orig}") from error
+        if writable:
+            try:
+                self._writer.connect().close()  # the log must be there before the first reader is
+            except DBAPIError as error:
+                raise StoreError(f"{self.path}: {_words(error)}") from error
         self._waiting: queue.SimpleQueue[_Work | _Submission | None] = queue.SimpleQueue()
+        self._door = threading.Lock()
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
         self._closed = not writable
@@ -179,9 +192,11 @@ class Store:
 
     def close(self) -> None:
         """Finish what waits, and close."""
-        if not self._closed:
-            self._closed = True
-            self._waiting.put(None)
+        with self._door:
+            if not self._closed:
+                self._closed = True
+                self._waiting.put(None)
+        if self._thread.is_alive():
             self._thread.join()
         self._writer.dispose()
         self._reader.dispose()
@@ -190,10 +205,13 @@ class Store:
 
     def write(self, effect: "Callable[[Transaction], T]") -> "Future[T]":
         """Have the effect done in a transaction; the future is done when it is durable."""
-        if self._closed:
-            raise StoreError(f"{self.path}: closed, or opened for reading only")
-        work = _Work(effect, Future())
-        self._waiting.put(work)
+        return self._put(_Work(effect, Future()))
+
+    def _put(self, work: "_Work | _Submission") -> "Future[Any]":
+        with self._door:
+            if self._closed:
+                raise StoreError(f"{self.path}: closed, or opened for reading only")
+            self._waiting.put(work)
         return work.answer
 
     def _write(self) -> None:
@@ -207,52 +225,72 @@ class Store:
 
     def _commit(self, batch: Sequence[_Work | _Submission]) -> None:
         batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
-        submissions = [work for work in batch if isinstance(work, _Submission)]
-        done: list[tuple[_Work | _Submission, Any]] = []
-        refused: list[tuple[_Work | _Submission, Exception]] = []
-        lines: list[str] = []
+        answers: list[tuple[_Work | _Submission, Any]] = []
+        done: list[Transaction] = []
+        pieces = _pieces(batch)
         try:
-            with self._writer.connect() as connection, connection.begin():
-                if submissions:
+            with self._writer.connect() as connection, self._journalled() as write, connection.begin():
+                while pieces:
+                    works, effect = pieces.pop(0)
                     transaction = Transaction(connection)
-                    for submission, answer in zip(submissions, _submit(transaction, submissions), strict=True):
-                        if isinstance(answer, Exception):
-                            refused.append((submission, answer))
-                        else:
-                            done.append((submission, answer))
-                    lines += transaction.lines
-                for work in batch:
-                    if isinstance(work, _Submission):
-                        continue
                     try:
                         with connection.begin_nested():
-                            transaction = Transaction(connection)
-                            done.append((work, work.effect(transaction)))
-                            lines += transaction.lines
-                    except DBAPIError:
-                        raise  # the whole database is in trouble
+                            results = effect(transaction)
+                        answers += zip(works, results, strict=True)
+                        done.append(transaction)
                     except Exception as error:
-                        refused.append((work, error))
-            self._append(lines)
-        except (DBAPIError, OSError) as error:
-            trouble = StoreError(f"{self.path}: {getattr(error, 'orig', None) or error}")
+                        if _spoils_all(connection, error):
+                            raise
+                        if len(works) == 1:
+                            answers.append((works[0], error))
+                        else:  # one of them is bad, the others are not
+                            pieces += [piece for work in works for piece in _pieces([work])]
+                write("".join(line for transaction in done for line in transaction.lines), any(t.durable for t in done))
+        except Exception as error:
+            trouble = StoreError(f"{self.path}: {_words(error)}")
             trouble.__cause__ = error
             for piece in batch:
                 piece.answer.set_exception(trouble)
             return
-        for piece, reason in refused:
-            piece.answer.set_exception(reason)
-        for piece, answer in done:
-            piece.answer.set_result(answer)
+        for piece, answer in answers:
+            if isinstance(answer, Exception):
+                piece.answer.set_exception(answer)
+            else:
+                piece.answer.set_result(answer)
         for listener in self.listeners:
             listener()
 
-    def _append(self, lines: Sequence[str]) -> None:
-        if lines:
-            with open(self.journal, "a", encoding="utf-8") as file:
-                file.write("".join(lines))
-                file.flush()
-                os.fsync(file.fileno())
+    @contextmanager
+    def _journalled(self) -> Iterator[Callable[[str, bool], None]]:
+        """Append to the journal; what was appended is taken back where the block ends badly.
+
+        A crash in between leaves lines that the database does not have, of what nobody was told.
+        """
+        before: list[int] = []
+
+        def write(text: str, durable: bool) -> None:
+            if not text:
+                return
+            fresh = not self.journal.exists()
+            with open(self.journal, "a+b", buffering=0) as file:
+                size = file.seek(0, os.SEEK_END)
+                before.append(size)
+                torn = size > 0 and os.pread(file.fileno(), 1, size - 1) != b"\n"  # by a crash: not to spoil a line
+                data = memoryview((b"\n" if torn else b"") + text.encode())
+                while data:
+                    data = data[file.write(data) :]
+                if durable:
+                    os.fsync(file.fileno())
+            if fresh:
+                flush_folder(self.journal.parent)
+
+        try:
+            yield write
+        except BaseException:
+            if before:
+                with suppress(OSError):
+                    os.truncate(self.journal, before[0])
+            raise
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -260,18 +298,14 @@ class Store:
         try:
             with self._reader.connect() as connection:
                 yield connection
-        except DBAPIError as error:
-            raise StoreError(f"{self.path}: {error.orig}") from error
+        except (DBAPIError, sa.exc.TimeoutError) as error:
+            raise StoreError(f"{self.path}: {_words(error)}") from error
 
     # --- submitting ---------------------------------------------------------------------------------------
 
     def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
-        if self._closed:
-            raise StoreError("the index is closed")
-        submission = _Submission(job, key, Future())
-        self._waiting.put(submission)
-        return submission.answer
+        return self._put(_Submission(job, key, Future()))
 
     def submit_sweep(
         self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
@@ -281,17 +315,18 @@ class Store:
         def effect(t: Transaction) -> SweepRecord:
             if (known := _known(t, key)) is not None:
                 return _sweep(t.connection, known)
-            seq, identifier = _insert_sweep(t, name, definition, duplicates)
+            row = _insert_sweep(t, name, definition, duplicates)
+            seq, identifier = row["seq"], row["id"]
             numbers = _jobs_of_points(t, points)
+            members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
+            t.note("sweep", **row, points=members)
             rows = [
-                {"sweep": seq, "position": i, "job": numbers[point.job.identity], "name": point.job.name,
-                 "parameters": dict(point.parameters)}
-                for i, point in enumerate(points)
-            ]  # fmt: skip
+                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": parameters}
+                for i, (job, label, parameters) in enumerate(members)
+            ]
             if rows:
                 t.run(sweep_jobs.insert(), rows)
             _remember(t, key, identifier)
-            t.note(kind="sweep", id=identifier, name=name, definition=definition)
             return _sweep(t.connection, identifier)
 
         return self.write(effect)
@@ -302,16 +337,15 @@ class Store:
         """Give queued jobs (by seq) their cores. One that is not queued any more is left out."""
 
         def effect(t: Transaction) -> list[Job]:
-            claimed = []
-            for seq, cores in choices:
-                job = _by_seq(t.connection, seq)
-                if job.state is not State.QUEUED:
-                    continue
-                now = time.time()
-                _move(t, job, Move.CLAIM, None, attempt=job.attempt + 1, started=job.started or now, ended=None)
-                row = {"job": seq, "number": job.attempt + 1, "cores": list(cores), "claimed": now}
-                t.run(attempts.insert(), [row])
-                claimed.append(_by_seq(t.connection, seq))
+            cores, now, claimed, rows = dict(choices), time.time(), list[Job](), list[dict[str, Any]]()
+            chosen = sa.select(jobs).where(jobs.c.seq.in_(cores), jobs.c.state == State.QUEUED)
+            for job in map(_record, t.run(chosen).all()):
+                number, started = job.attempt + 1, job.started or now
+                claimed.append(_move(t, job, Move.CLAIM, None, attempt=number, started=started, ended=None))
+                rows.append({"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now})
+                t.note("attempt", **rows[-1])
+            if rows:
+                t.run(attempts.insert(), rows)
             return claimed
 
         return self.write(effect)
@@ -323,8 +357,7 @@ class Store:
             job = _job(t.connection, identifier)
             if (job.attempt, job.state) != (attempt, State.STARTING):
                 return job
-            which = (attempts.c.job == job.seq) & (attempts.c.number == attempt)
-            t.run(attempts.update().where(which).values(pid=pid, pid_start=pid_start, boot=boot))
+            _set_attempt(t, job, pid=pid, pid_start=pid_start, boot=boot)
             return _move(t, job, Move.START, None)
 
         return self.write(effect)
@@ -341,11 +374,8 @@ class Store:
             if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
                 broke, move = False, Move.STOP
             state = after(job.state, move)
-            which = (attempts.c.job == job.seq) & (attempts.c.number == end.attempt)
-            t.run(
-                attempts.update().where(which).values(
-                    ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
-                )
+            _set_attempt(
+                t, job, ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
             )  # fmt: skip
             failures = job.failures + 1 if broke else 0
             return _move(
@@ -382,10 +412,12 @@ class Store:
             if job.state is State.CANCELLED:
                 return job
             if job.state.active:
-                t.run(jobs.update().where(jobs.c.seq == job.seq).values(stopping=True))
+                _set(t, job, stopping=True)
+                t.durable = True
                 return _by_seq(t.connection, job.seq)
             if job.state in (State.ERROR, State.LOST) and not job.retrying:
                 raise TransitionError(job.state, Move.CANCEL)
+            t.durable = True
             return _move(t, job, Move.CANCEL, None, retrying=False, ended=time.time())
 
         return self.write(effect)
@@ -406,7 +438,10 @@ class Store:
         return self.write(effect)
 
     def ingest(self, seq: int, rows: Sequence[tuple[int, str]], times: Sequence[tuple[int, float]]) -> "Future[None]":
-        """History rows (number, JSON line) and times of complete snapshots (number, time) of a job."""
+        """History rows (number, JSON line) and times of complete snapshots (number, time) of a job.
+
+        Of a history that was cut back, what came after the first of these rows is forgotten.
+        """
 
         def effect(t: Transaction) -> None:
             if rows:
@@ -416,7 +451,8 @@ class Store:
                      "data": line}
                     for (number, line), tree in zip(rows, trees, strict=True)
                 ]  # fmt: skip
-                t.run(history.insert().prefix_with("OR REPLACE"), values)
+                t.run(history.delete().where(history.c.job == seq, history.c.row >= rows[0][0]))
+                t.run(history.insert(), values)
             if times:
                 values = [{"job": seq, "number": number, "time": at} for number, at in times]
                 t.run(snapshots.insert().prefix_with("OR REPLACE"), values)
@@ -644,6 +680,27 @@ def _compact(tree: Any) -> str:
     return json.dumps(tree, separators=(",", ":"), allow_nan=False)
 
 
+def _spoils_all(connection: Connection, error: Exception) -> bool:
+    """Whether an error ended the whole transaction, or tells of trouble with the database that others will have too."""
+    raw = connection.connection.dbapi_connection
+    return _code(error) in TROUBLE or not getattr(raw, "in_transaction", False)
+
+
+def _code(error: BaseException) -> int | None:
+    """SQLite's primary code."""
+    code = getattr(getattr(error, "orig", error), "sqlite_errorcode", None)
+    return None if code is None else int(code) & 0xFF
+
+
+def _words(error: BaseException) -> str:
+    """What went wrong first: SQLite's word, or the system's; not of the savepoint that was lost by it."""
+    first = error
+    while _code(first) not in TROUBLE and first.__context__ is not None:
+        first = first.__context__
+    told = first if _code(first) in TROUBLE else error
+    return str(getattr(told, "orig", None) or told)
+
+
 # --- pieces of transactions -------------------------------------------------------------------------------
 
 
@@ -685,15 +742,27 @@ def _attempts(connection: Connection, job: Job) -> list[Attempt]:
 
 def _move(t: Transaction, job: Job, move: Move, message: str | None, **values: Any) -> Job:
     """Change a job's state and tell it as an event."""
-    state = after(job.state, move)
-    changes = {"state": state, "message": message, **values}
-    t.run(jobs.update().where(jobs.c.seq == job.seq).values(changes))
-    t.run(events.insert(), [{"job": job.seq, "at": time.time(), "state": state, "message": message}])
-    return _by_seq(t.connection, job.seq)
+    state, now = after(job.state, move), time.time()
+    _set(t, job, event=now, state=state, message=message, **values)
+    t.run(events.insert(), [{"job": job.seq, "at": now, "state": state, "message": message}])
+    return replace(job, state=state, message=message, **values)
+
+
+def _set(t: Transaction, job: Job, event: float | None = None, **values: Any) -> None:
+    """Change columns of a job; `event`: when that made an event."""
+    t.run(jobs.update().where(jobs.c.seq == job.seq).values(values))
+    t.note("set", job=job.seq, event=event, values=values)
+
+
+def _set_attempt(t: Transaction, job: Job, **values: Any) -> None:
+    """Change columns of a job's present attempt."""
+    t.run(attempts.update().where(attempts.c.job == job.seq, attempts.c.number == job.attempt).values(values))
+    t.note("attempt", job=job.seq, number=job.attempt, **values)
 
 
 def _retry(t: Transaction, job: Job) -> Job:
     """A new life: what broke before does not count."""
+    t.durable = True
     return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None)
 
 
@@ -728,14 +797,22 @@ def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReus
     ]
     if rows:
         t.run(idempotency.insert(), rows)
-    for job in made:
-        t.note(kind="job", id=job.id, name=job.name, ranks=job.ranks, priority=job.priority, tags=job.tags,
-               time_limit=job.time_limit, case=job.case)  # fmt: skip
     return [
         place if isinstance(place, KeyReusedError) else made[place] if isinstance(place, int)
         else _job(t.connection, place)
         for place in places
     ]  # fmt: skip
+
+
+def _pieces(batch: "Sequence[_Work | _Submission]") -> "list[_Piece]":
+    """What is done in a savepoint each: all submissions at once, everything else by itself."""
+    submissions = [work for work in batch if isinstance(work, _Submission)]
+    pieces: list[_Piece] = [([work], _alone(work)) for work in batch if isinstance(work, _Work)]
+    return [(submissions, lambda t: _submit(t, submissions)), *pieces] if submissions else pieces
+
+
+def _alone(work: _Work) -> "Callable[[Transaction], list[Any]]":
+    return lambda t: [work.effect(t)]
 
 
 def _reused(key: Key) -> KeyReusedError:
@@ -760,6 +837,9 @@ def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
     last = t.run(sa.select(sa.func.max(jobs.c.seq))).scalar_one()
     numbers = range(last - len(made) + 1, last + 1)
     t.run(events.insert(), [{"job": seq, "at": now, "state": State.QUEUED} for seq in numbers])
+    for seq, row in zip(numbers, made, strict=True):
+        t.note("job", seq=seq, **row)
+    t.durable = True
     empty = {"message": None, "started": None, "ended": None, "core_seconds": None}
     return [
         Job(**{**row, **empty, "seq": seq, "tags": tuple(row["tags"])})
@@ -777,30 +857,39 @@ def _existing_ids(connection: Connection, which: Sequence[str]) -> dict[str, int
 
 
 def _existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
-    """The seq of the newest job of each identity."""
+    """The seq of a job of each identity: of one that succeeded, if any did, else of the newest."""
+    done = sa.case((jobs.c.state == State.SUCCEEDED, SUCCEEDED), else_=0)
     found: dict[str, int] = {}
     for k in range(0, len(which), 500):
-        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq)).where(jobs.c.identity.in_(which[k : k + 500]))
-        found |= {identity: seq for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
+        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq + done)).where(jobs.c.identity.in_(which[k : k + 500]))
+        found |= {identity: seq % SUCCEEDED for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
     return found
 
 
 def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
     """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done."""
     numbers = _existing(t.connection, [point.job.identity for point in points])
-    for seq in numbers.values():
-        job = _by_seq(t.connection, seq)
-        if job.final and job.state not in (State.SUCCEEDED, State.FAILED):
-            _retry(t, job)
-    new = _insert(t, [point.job for point in points if point.job.identity not in numbers])
+    undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
+    old = list(numbers.values())
+    for k in range(0, len(old), 500):
+        query = sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]), undone)
+        for row in t.run(query).all():
+            _retry(t, _record(row))
+    missing: dict[str, NewJob] = {}
+    for point in points:
+        if point.job.identity not in numbers:
+            missing.setdefault(point.job.identity, point.job)
+    new = _insert(t, list(missing.values()))
     return numbers | {job.identity: job.seq for job in new}
 
 
-def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> tuple[int, str]:
-    count = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
-    identifier = f"s{count}"
-    row = {"id": identifier, "name": name, "definition": definition, "duplicates": duplicates, "created": time.time()}
-    return int(t.run(sweeps.insert().values(row)).lastrowid), identifier
+def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> dict[str, Any]:
+    seq = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
+    row = {"seq": seq, "id": f"s{seq}", "name": name, "definition": definition, "duplicates": duplicates}
+    row["created"] = time.time()
+    t.run(sweeps.insert(), [row])
+    t.durable = True
+    return row
 
 
 def _sweep(connection: Connection, identifier: str) -> SweepRecord:
@@ -832,5 +921,7 @@ def _known(t: Transaction, key: Key | None) -> str | None:
 
 def _remember(t: Transaction, key: Key | None, resource: str) -> None:
     if key is not None:
-        row = {"key": f"{key.scope} {key.value}", "fingerprint": key.fingerprint, "resource": resource}
-        t.run(idempotency.insert(), [{**row, "created": time.time()}])
+        named = {"key": f"{key.scope} {key.value}", "fingerprint": key.fingerprint, "resource": resource}
+        row = {**named, "created": time.time()}
+        t.run(idempotency.insert(), [row])
+        t.note("key", **row)

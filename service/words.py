@@ -1,12 +1,21 @@
 """What the commands share: refusals, cells of tables, progress in words."""
 
+import sys
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
 SweepFile = Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="TOML or JSON.")]
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+DataFolder = Annotated[
+    Path, typer.Option("--data", metavar="DIR", file_okay=False, envvar="FRIT_DATA", help="Data folder.")
+]
 
 
 def refuse(*lines: str) -> NoReturn:
@@ -14,6 +23,24 @@ def refuse(*lines: str) -> NoReturn:
     for line in lines:
         typer.echo(line, err=True)
     raise typer.Exit(2)
+
+
+def fail(*lines: str) -> NoReturn:
+    """Say on stderr what went wrong, and leave with 1."""
+    for line in lines:
+        typer.echo(line, err=True)
+    raise typer.Exit(1)
+
+
+def show_table(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Rows as a table; columns in which nobody has anything are left out."""
+    keys = [key for key in (rows[0] if rows else {}) if any(row.get(key) is not None for row in rows)]
+    table = Table(box=None, pad_edge=False)
+    for key in keys:
+        table.add_column(key.replace("_", " "), overflow="fold")
+    for row in rows:
+        table.add_row(*(cell(row.get(key)) for key in keys))
+    Console(width=None if sys.stdout.isatty() else 200, markup=False).print(table)
 
 
 def cell(value: object) -> str:

@@ -20,11 +20,13 @@ import numpy as np
 
 from . import checkpoint, output, slots
 from .arrays import Floats
-from .case import Case, CaseError, Problem, load_case
+from .case import Case, CaseError, load_case
 from .checkpoint import CheckpointError
 from .geometry import Mesh, MeshError
 from .integrators import Integrator
 from .observe import Observables
+from .pack_store import place
+from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
 from .prepare import build_mesh, make_integrator, prepare
 from .run import RunError, run
@@ -32,7 +34,7 @@ from .scheme import Scheme
 from .shape import ShapeError
 from .state import State
 
-REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, output.DirectoryError)
+REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
 LONGEST_WAIT = 25  # steps for which a checkpoint that is due waits for one from which the run goes on without a trace
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
@@ -85,9 +87,10 @@ def execute(
 ) -> tuple[str, str | None]:
     """The whole run: how it ended, and a message where it did not end well."""
     fresh = arguments.resume is None
-    case: Case = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
-    mesh = build_mesh(case, ranks)
-    kept = None if fresh else ranks.from_root(checkpoint.read(directory, case.identity(), mesh) if ranks.root else None)
+    asked: Case = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
+    case, packing = ranks.from_root(place(asked, directory, fresh) if ranks.root else None)
+    mesh, identity = build_mesh(case, ranks), asked.identity()
+    kept = None if fresh else ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
     scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
     if kept:
         nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
@@ -95,7 +98,10 @@ def execute(
             kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1]
         )
     integrator = make_integrator(case, mesh, kept.memory if kept else None)
-    recorder = Recorder(directory, mesh, scheme, state, kept.wall_time if kept else None, requests, arguments.progress)
+    if ranks.root:
+        record_start(directory, asked, ranks.size, fresh, packing)
+    wall_time = kept.wall_time if kept else None
+    recorder = Recorder(directory, mesh, scheme, state, identity, wall_time, requests, arguments.progress)
     try:
         finished = run(scheme, state, integrator, recorder)
         recorder.checkpoint(scheme, state, integrator)
@@ -123,8 +129,6 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:
     if not fresh:
         return load_case(directory / "case.json")
     case = load_case(arguments.case)
-    if case.particles.source == "packing":
-        raise CaseError([Problem("particles.source", "packing", "is not there yet; allowed: list, file")])
     (directory / "case.json").write_text(case.resolved_json())
     return case
 
@@ -138,12 +142,13 @@ class Recorder:
         mesh: Mesh,
         scheme: Scheme,
         state: State,
+        identity: str,
         wall_time: float | None,
         requests: Requests,
         progress: bool,
     ) -> None:
-        """wall_time: seconds that the run has already taken before it was resumed; None: a fresh run."""
-        case, self.ranks = scheme.d.case, scheme.d.share.ranks
+        """identity: of the case as asked; wall_time: seconds that a resumed run has taken before, None: a fresh run."""
+        case, self.ranks, self.identity = scheme.d.case, scheme.d.share.ranks, identity
         fresh = wall_time is None
         self.directory, self.mesh, self.requests, self.progress = directory, mesh, requests, progress
         self.began = time.monotonic() - (wall_time or 0.0)
@@ -155,8 +160,6 @@ class Recorder:
         self.waited = 0
         self.latest: dict[str, Any] = {}  # history row
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
-        if self.ranks.root:
-            record_start(directory, case, self.ranks.size, fresh)
 
     def history(self, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
         """Append a row."""
@@ -191,7 +194,7 @@ class Recorder:
         if self.rows is not None:
             self.rows.sync()
         notes = {
-            "identity": scheme.d.case.identity(), "memory": integrator.memory, "wall_time": self._wall_time(),
+            "identity": self.identity, "memory": integrator.memory, "wall_time": self._wall_time(),
         }  # fmt: skip
         checkpoint.write(self.directory, scheme, state, self.collector, self.mesh, notes)
         self.checkpoint_time, self.checkpoint_clock = state.time, time.monotonic()
@@ -224,8 +227,10 @@ class Recorder:
         print(json.dumps(line), flush=True)
 
 
-def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
-    """run.json: what runs here, with which versions, since when. A resumed run keeps the first start."""
+def record_start(
+    directory: Path, case: Case, ranks: int, fresh: bool, packing: dict[str, Any] | None = None
+) -> None:
+    """run.json: what runs here, with which versions and packing, since when. A resumed run keeps the first start."""
     path = directory / "run.json"
     before = json.loads(path.read_text()) if path.exists() and not fresh else {}
     record = {
@@ -236,7 +241,8 @@ def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
         "name": case.name,
         "ranks": ranks,
         "host": socket.gethostname(),
-        "seeds": {"particles": getattr(case.particles, "seed", None)},
+        "seeds": {"particles": case.particles.seed},
+        "packing": packing or before.get("packing"),
         "versions": versions(),
         "start": before.get("start", output.now()),
         "resumed": [*before.get("resumed", []), *([] if fresh else [output.now()])],
@@ -246,7 +252,7 @@ def record_start(directory: Path, case: Case, ranks: int, fresh: bool) -> None:
 
 
 def record_end(directory: Path, state: str, message: str | None, retry: bool = False) -> None:
-    """How it ended, into run.json; the message into log.txt too. retry: not the case's fault, it may go better again."""
+    """How it ended, into run.json; the message into log.txt too. retry: the machinery broke, not the case."""
     path = directory / "run.json"
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     record |= {"state": state, "message": message, "retry": retry, "end": output.now()}

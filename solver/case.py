@@ -12,7 +12,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import count, pairwise, takewhile
@@ -37,9 +37,12 @@ from pydantic import (
 )
 from scipy.spatial import cKDTree
 
+from . import particle_file
 from .arrays import Flags, Floats
+from .particle_file import ParticleFileError
 
 CANONICAL = json.JSONEncoder(sort_keys=True)
+PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
 # --- vocabulary
@@ -211,9 +214,10 @@ class Particles(Table):
     owned: ClassVar = {
         ("list", "sphere"): {"centres": ..., "radii": ...},
         ("list", "box"): {"centres": ..., "sizes": ...},
-        ("file", "sphere"): {"path": ...},
-        ("packing", "sphere"): {"mean_radius": ..., "std_radius": 0.0, "seed": 0, "container": ...}
-        | {"packing_density": None, "count": None},
+        ("file", "sphere"): {"path": ..., "units": "nm"},
+        ("packing", "sphere"): {"method": ..., "distribution": "normal", "mean_radius": None, "std_radius": None}
+        | {"truncation": None, "histogram": (), "packing_density": None, "count": None, "seed": 0, "container": ...}
+        | {"friction": 0.0, "exchange": False},
     }
 
     source: Literal["list", "file", "packing"] = "list"
@@ -227,19 +231,37 @@ class Particles(Table):
     sizes: tuple[Edges, ...] = ()
     """edge lengths, nm: one set per particle (list of boxes)"""
     path: Text | None = None
-    """CSV of x,y[,z],radius, nm; relative to the case file (file)"""
+    """CSV of x,y[,z],radius, or a .cloud file of x y z r; relative to the case file (file)"""
+    units: Literal["nm", "um", "mm", "m"] | None = None
+    """of the lengths in that file (file; default nm)"""
+    method: Literal["pour", "density"] | None = None
+    """pour: gravity fills the container, along the last axis; density: a lid presses the particles in the container
+    to a solid fraction (packing; default: density where packing_density is given, pour where count is)"""
+    distribution: Literal["normal", "lognormal", "histogram"] | None = None
+    """of the radii (packing; default normal)"""
     mean_radius: Positive | None = None
     """mean of the radii, nm (packing)"""
     std_radius: NonNegative | None = None
     """standard deviation of the radii, nm (packing; default 0)"""
+    truncation: Annotated[float, FINITE, Field(gt=0, le=6)] | None = None
+    """radii are drawn within this many standard deviations of the mean [1], and not below a fifth of it; for
+    lognormal: of the logarithm (packing; default 3)"""
+    histogram: tuple[tuple[Positive, Positive], ...] = ()
+    """pairs of radius, nm, and weight [1], instead of mean_radius and std_radius (packing, histogram)"""
     packing_density: Fraction | None = None
-    """solid fraction of the container [1] (packing; this or count)"""
+    """solid fraction [1], within 0.005, of output.vacancy_box, or of the container where that box is not inside it
+    or particles are poured (packing; this or count)"""
     count: Annotated[int, Field(strict=True, ge=1)] | None = None
     """number of particles (packing; this or packing_density)"""
     seed: Annotated[int, Field(strict=True, ge=0)] | None = None
     """seed of the random draw (packing; default 0)"""
     container: Box | None = None
     """lower and upper corner of the packed box, nm (packing)"""
+    friction: NonNegative | None = None
+    """Coulomb's coefficient between particles [1]; walls are smooth (packing, pour; default 0)"""
+    exchange: Flag | None = None
+    """let shaken particles exchange radii: denser than random close packing where radii differ (packing, density;
+    default false)"""
     interface_width: Positive = 1.0
     """xi, nm: eta(a) = (1 - tanh((d_a - R_a) / xi)) / 2 at t = 0, eq. (34)"""
 
@@ -249,13 +271,23 @@ class Particles(Table):
         given, n = getattr(self, name), len(self.centres)
         if self.source == "list" and len(given) != n:
             raise CaseError([Problem(name, list(given), f"must be {n}, one per centre, not {len(given)}")])
-        if self.source == "packing" and (self.count is None) == (self.packing_density is None):
-            raise CaseError([Problem("packing_density", self.packing_density, "give either this or count")])
+        if self.source == "packing":
+            _refuse(_packing_problems(self))
         return self
 
     def tree(self) -> dict[str, Any]:
         """Lists of another source or shape are absent, not empty."""
         return {key: value for key, value in super().tree().items() if value != []}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose(cls, tree: object) -> object:
+        """Defaults of a packing that depend on what else was given."""
+        if not isinstance(tree, Mapping) or tree.get("source") != "packing":
+            return tree
+        given = {key: value for key, value in tree.items() if value is not None}
+        drawn = {} if given.get("distribution") == "histogram" else {"std_radius": 0.0, "truncation": 3.0}
+        return {"method": "pour" if "count" in given else "density"} | drawn | given
 
     def extents(self) -> tuple[Floats, Floats]:
         """Centres, and half widths along the axes, of a list: both (particles, dim)."""
@@ -427,8 +459,13 @@ class Case(Table):
     def _read_list(cls, particles: Particles, info: ValidationInfo) -> Particles:
         if particles.path is None or "domain" not in info.data:
             return particles
-        centres, radii = _read_csv(_absolute(particles.path, info), len(info.data["domain"].size))
-        return Particles(centres=centres, radii=radii, interface_width=particles.interface_width)
+        path = _absolute(particles.path, info)
+        try:
+            centres, radii = particle_file.read(path, len(info.data["domain"].size), particles.units or "nm")
+        except ParticleFileError as error:
+            raise CaseError(Problem("path", path, text) for text in error.problems) from error
+        width = particles.interface_width
+        return Particles(centres=centres.tolist(), radii=radii.tolist(), interface_width=width)
 
     @field_validator("output", mode="before")
     @classmethod
@@ -478,6 +515,28 @@ class Case(Table):
         return fingerprint({name: canonical(table.essence(table.tree())) for name, table in tables})
 
 
+def _packing_problems(given: Particles) -> Iterator[Problem]:
+    if (given.count is None) == (given.packing_density is None):
+        yield Problem("packing_density", given.packing_density, "give either this or count")
+    drawn = ("mean_radius", "std_radius", "truncation")
+    if given.distribution != "histogram":
+        if given.mean_radius is None:
+            about = _about(Particles, "mean_radius")
+            yield Problem("mean_radius", None, f"must be given with source = 'packing'{about}")
+        if given.histogram:
+            yield Problem("histogram", given.histogram, "belongs to distribution = 'histogram'")
+    else:
+        if not given.histogram:
+            yield Problem("histogram", None, f"must be given{_about(Particles, 'histogram')}")
+        for name in drawn:
+            if (value := getattr(given, name)) is not None:
+                yield Problem(name, value, "does not belong to distribution = 'histogram'")
+    if given.method == "pour" and given.exchange:
+        yield Problem("exchange", True, "must be false with method = 'pour'")
+    if given.method == "density" and given.friction:
+        yield Problem("friction", given.friction, "must be 0 with method = 'density', which presses without friction")
+
+
 def canonical(tree: Mapping[str, Any]) -> str:
     """The one JSON text of a tree."""
     return CANONICAL.encode(tree)
@@ -492,7 +551,9 @@ def fingerprint(tables: Mapping[str, str]) -> str:
 # --- across tables
 
 
-def filled_in(output: Mapping[str, Any], end: float, domain: Domain | None, particles: Particles | None) -> dict[str, Any]:
+def filled_in(
+    output: Mapping[str, Any], end: float, domain: Domain | None, particles: Particles | None
+) -> dict[str, Any]:
     """The plain table with the defaults that need other tables."""
     given = {key: value for key, value in output.items() if value is not None}
     if "vacancy_box" not in given:
@@ -569,10 +630,12 @@ def _particles_apart(case: Case) -> Iterator[Problem]:
 
 def _particles_resolved(case: Case) -> Iterator[Problem]:
     """h <= the smallest radius or half edge; before a packing is drawn only the mean is known."""
-    spacing, mean = case.nodes.spacing, case.particles.mean_radius
-    smallest = case.particles.smallest() if mean is None else mean
+    spacing, given = case.nodes.spacing, case.particles
+    if given.source == "packing":
+        smallest, what = given.mean_radius or min(radius for radius, _ in given.histogram), "particles.mean_radius"
+    else:
+        smallest, what = given.smallest(), "the smallest radius or half edge"
     if spacing is not None and spacing > smallest:
-        what = "the smallest radius or half edge" if mean is None else "particles.mean_radius"
         yield Problem("nodes.spacing", spacing, f"must be at most {what}, {smallest}")
 
 
@@ -655,8 +718,7 @@ def problems(error: ValidationError, table_at: Callable[[Place], type[BaseModel]
             about = _about(table_at(loc), loc[-1]) if isinstance(loc[-1], str) else ""
             yield Problem(_dotted(loc), None, f"must be given{about}")
         else:
-            plain = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}.get(kind)
-            allowed = plain or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
+            allowed = PLAIN.get(kind) or re.sub(r"^\w+ should ", "must ", entry["msg"]).replace(" after validation", "")
             if kind == "extra_forbidden":
                 allowed = _known(str(loc[-1]), table_at(loc))
             yield Problem(_dotted(loc), entry["input"], allowed)
@@ -697,34 +759,3 @@ def unknown_part(key: str) -> str | None:
         below = Every if part == "snapshots" else table.model_fields[part].annotation
         table = below if isinstance(below, type) and issubclass(below, BaseModel) else None
     return None
-
-
-def _read_csv(path: str, dim: int) -> tuple[tuple[Point, ...], tuple[float, ...]]:
-    """Centres and radii. Blank lines, lines that start with # and a header `x,y[,z],radius` are skipped."""
-    names = [*"xyz"[:dim], "radius"]
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, ValueError) as error:
-        raise CaseError([Problem("path", path, f"cannot be read: {error}")]) from error
-    table = {n: [cell.strip() for cell in line.split(",")] for n, line in enumerate(lines, start=1)}
-    table = {n: cells for n, cells in table.items() if cells != [""] and not cells[0].startswith("#")}
-    if table and [cell.lower() for cell in table[min(table)]] == names:
-        del table[min(table)]
-    wrong = [text for n, cells in table.items() for text in _wrong_cells(n, cells, names)]
-    _refuse(Problem("path", path, text) for text in (wrong if table else ["holds no particles"]))
-    rows = [tuple(map(float, cells)) for cells in table.values()]
-    return tuple(row[:-1] for row in rows), tuple(row[-1] for row in rows)
-
-
-def _wrong_cells(line: int, cells: Sequence[str], names: Sequence[str]) -> Iterator[str]:
-    if len(cells) != len(names):
-        yield f"line {line} has {len(cells)} columns, must have {len(names)}: {','.join(names)}"
-        return
-    for column, (cell, name) in enumerate(zip(cells, names, strict=True), start=1):
-        try:
-            good = 0 < float(cell) < math.inf if name == "radius" else math.isfinite(float(cell))
-        except ValueError:
-            good = False
-        if not good:
-            allowed = "a number greater than 0" if name == "radius" else "a number"
-            yield f"line {line}, column {column} ({name}) is {cell!r}, must be {allowed}"

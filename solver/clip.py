@@ -1,4 +1,4 @@
-"""The part of each cell in a box: exact volumes and centroids, for averages over a box that cuts cells."""
+"""The part of each cell in a box, as simplices: what integrals over a box that cuts cells are made of."""
 
 import numpy as np
 
@@ -8,24 +8,30 @@ from .jit import jit
 DEPTH = 16  # of the stack: at most 6 cuts, each replaces the simplex on top by at most 3: 1 + 6 * 2 = 13
 
 
-def clip_cells(nodes: Floats, cells: Numbers, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
-    """Volumes (p,) and centroids (p, dim) of the cells' intersections with the box [lower, upper].
+def clip_cells(nodes: Floats, cells: Numbers, lower: Floats, upper: Floats) -> tuple[Floats, Floats, Integers]:
+    """The intersections of the cells with the box [lower, upper] as simplices that do not overlap.
 
-    The integral of a linear field over the box is sum_p volume_p field(centroid_p), exactly. A cell outside
-    has volume 0 and keeps its barycentre.
+    corners (s, dim + 1, dim), volumes (s,) > 0 and the place in `cells` of the cell that each is a part of (s,), in
+    rising order. A cell inside the box is its own part.
     """
     dim = nodes.shape[1]
     low, high = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
     if low.shape != (dim,) or high.shape != (dim,) or not (low < high).all():
         raise ValueError(f"box from {low.tolist()} to {high.tolist()}: {dim} increasing intervals are needed")
-    volumes, centroids = np.zeros(len(cells)), np.zeros((len(cells), dim))
-    clip(volumes, centroids, nodes, cells, np.concatenate((low, -high)))
-    return volumes, centroids
+    room, found = 0, len(cells) + 64
+    while found > room:  # a second time only where cells are cut into more simplices than cells
+        room = found
+        corners, volumes, owner = np.empty((room, dim + 1, dim)), np.empty(room), np.empty(room, dtype=np.int64)
+        found = clip(corners, volumes, owner, nodes, cells, np.concatenate((low, -high)))
+    return corners[:found], volumes[:found], owner[:found]
 
 
 @jit
-def clip(volumes: Floats, centroids: Floats, nodes: Floats, cells: Numbers, bounds: Floats) -> None:
-    """Cut each cell by half-space after half-space, depth first, and gather the simplices that are left over.
+def clip(
+    corners: Floats, volumes: Floats, owner: Integers, nodes: Floats, cells: Numbers, bounds: Floats
+) -> int:
+    """Cut each cell by half-space after half-space, depth first, and gather the simplices that are left over, as far as
+    there is room for them; returns their number.
 
     Half-space i < dim: x_i >= bounds_i; half-space i >= dim: -x_(i - dim) >= bounds_i.
     """
@@ -33,20 +39,55 @@ def clip(volumes: Floats, centroids: Floats, nodes: Floats, cells: Numbers, boun
     stack = np.empty((DEPTH, dim + 1, dim))  # simplices
     done = np.empty(DEPTH, np.int64)  # the number of half-spaces that have cut each of them
     x, distance, prism = np.empty((dim + 1, dim)), np.empty(dim + 1), np.empty((2, dim, dim))
+    count = 0
     for p in range(len(cells)):
+        if outside(nodes, cells[p], bounds):
+            continue
         for corner in range(dim + 1):
             for i in range(dim):
                 stack[0, corner, i] = nodes[cells[p, corner], i]
-                centroids[p, i] += nodes[cells[p, corner], i] / (dim + 1)
-        done[0], top = 0, 0
+        done[0], top = 2 * dim if inside(nodes, cells[p], bounds) else 0, 0
         while top >= 0:
-            if done[top] == 2 * dim:
-                gather(volumes, centroids, p, stack[top])
-                top -= 1
-            else:
+            if done[top] < 2 * dim:
                 kept = arrange(x, distance, stack[top], done[top], bounds)
                 done[top] += 1
                 top = replace(stack, done, top, kept, x, distance, prism)
+                continue
+            part = volume(stack[top])
+            if part > 0.0:
+                if count < len(owner):
+                    volumes[count], owner[count] = part, p
+                    for corner in range(dim + 1):
+                        for i in range(dim):
+                            corners[count, corner, i] = stack[top, corner, i]
+                count += 1
+            top -= 1
+    return count
+
+
+@jit
+def outside(nodes: Floats, cell: Numbers, bounds: Floats) -> bool:
+    """Whether all corners are beyond one of the half-spaces."""
+    dim = nodes.shape[1]
+    for i in range(dim):
+        below, above = True, True
+        for a in cell:
+            below &= nodes[a, i] <= bounds[i]
+            above &= -nodes[a, i] <= bounds[dim + i]
+        if below or above:
+            return True
+    return False
+
+
+@jit
+def inside(nodes: Floats, cell: Numbers, bounds: Floats) -> bool:
+    """Whether all corners are in all half-spaces."""
+    dim = nodes.shape[1]
+    for a in cell:
+        for i in range(dim):
+            if nodes[a, i] < bounds[i] or -nodes[a, i] < bounds[dim + i]:
+                return False
+    return True
 
 
 @jit
@@ -108,21 +149,14 @@ def section(target: Floats, m: int, row: int, x: Floats, distance: Floats, a: in
 
 
 @jit
-def gather(volumes: Floats, centroids: Floats, p: int, x: Floats) -> None:
-    """Add simplex x to volume p and move centroid p towards its barycentre by its share of the volume."""
-    dim = x.shape[1]
-    volume = (x[1, 0] - x[0, 0]) * (x[2, 1] - x[0, 1]) - (x[1, 1] - x[0, 1]) * (x[2, 0] - x[0, 0])
-    if dim == 3:
-        volume = 0.0
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            minor = (x[2, j] - x[0, j]) * (x[3, k] - x[0, k]) - (x[2, k] - x[0, k]) * (x[3, j] - x[0, j])
-            volume += (x[1, i] - x[0, i]) * minor
-    volume = abs(volume) / (2.0 if dim == 2 else 6.0)
-    if volume > 0.0:
-        volumes[p] += volume
-        for i in range(dim):
-            mean = 0.0
-            for corner in range(dim + 1):
-                mean += x[corner, i] / (dim + 1)
-            centroids[p, i] += volume / volumes[p] * (mean - centroids[p, i])
+def volume(x: Floats) -> float:
+    """|det(x_1 - x_0, ..., x_dim - x_0)| / dim!"""
+    dim, determinant = x.shape[1], 0.0
+    if dim == 2:
+        determinant += (x[1, 0] - x[0, 0]) * (x[2, 1] - x[0, 1]) - (x[1, 1] - x[0, 1]) * (x[2, 0] - x[0, 0])
+        return float(abs(determinant)) / 2.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        minor = (x[2, j] - x[0, j]) * (x[3, k] - x[0, k]) - (x[2, k] - x[0, k]) * (x[3, j] - x[0, j])
+        determinant += (x[1, i] - x[0, i]) * minor
+    return float(abs(determinant)) / 6.0

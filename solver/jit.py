@@ -14,22 +14,27 @@ from typing import Any, TypeVar, cast
 import numba
 
 COMPILED = (
-    "simd.py", "energy.py", "kernels.py", "shape.py", "clip.py", "slots.py", "jit.py",
+    "simd.py", "energy.py", "kernels.py", "shape.py", "clip.py", "box.py", "slots.py", "dem.py", "jit.py",
 )
 
 # Reassociation, contraction and reciprocals, but NaN and infinity keep their meaning: a bad state must be seen.
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
 
+def cache_root() -> Path:
+    """Where frit keeps what it can make again: `FRIT_CACHE_DIR`, or `frit` in the user's cache."""
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "frit"
+    return Path(os.environ.get("FRIT_CACHE_DIR", default))
+
+
 def cache_folder() -> Path:
-    """The folder of the compiled code: `FRIT_CACHE_DIR` or the user's cache, then a hash of the compiled sources."""
+    """The folder of the compiled code: a hash of the compiled sources names it."""
     here = Path(__file__).parent
     digest = hashlib.sha256(numba.__version__.encode())
     for name in COMPILED:
         if (here / name).exists():
             digest.update((here / name).read_bytes())
-    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "frit"
-    return Path(os.environ.get("FRIT_CACHE_DIR", default)) / digest.hexdigest()[:16]
+    return cache_root() / digest.hexdigest()[:16]
 
 
 numba.config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]  # numba makes its settings at import

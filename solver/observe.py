@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from . import kernels
+from . import box, kernels
 from .arrays import Floats
 from .case import Case
-from .clip import clip_cells
-from .discretisation import Discretisation, shape_table
+from .discretisation import Discretisation
 from .geometry import Mesh
 from .neck import Neck
 from .partition import Collector
@@ -75,22 +74,6 @@ def distance(moments: Floats) -> float | None:
 
 
 def box_weights(case: Case, mesh: Mesh, d: Discretisation, low: Floats, high: Floats) -> Floats:
-    """omega (n,) on this rank's nodes, zero where another rank owns the node, with int_box rho dV = sum omega_a rho_a.
-
-    Whole cells contribute as in the scheme, w_p N_a(x_p). A cell that the box cuts contributes the exact volume of the
-    part inside times N_a at that part's barycentre: exact for linear fields.
-    """
-    points = d.share.points
-    volumes, centroids = clip_cells(mesh.nodes, mesh.cells[points], low, high)
-    whole = np.isclose(volumes, d.weights, rtol=1e-12, atol=0.0)
-    cut = np.flatnonzero((volumes > 0.0) & ~whole)
-    counts = np.diff(d.shape.offsets)
-    inside = np.repeat(np.where(whole, d.weights, 0.0), counts) * d.shape.entries()[0]
-    weights = np.zeros(d.share.total)
-    np.add.at(weights, d.share.nodes[d.shape.nodes], inside)
-    if cut.size:
-        cells = points[cut]
-        table = shape_table(case, centroids[cut], mesh.spacing[cells], mesh.cells[cells], mesh.nodes)
-        np.add.at(weights, table.nodes, np.repeat(volumes[cut], np.diff(table.offsets)) * table.entries()[0])
-    d.share.ranks.sum(weights)
+    """omega (n,) on this rank's nodes, zero where another rank owns the node: int_box rho dV = sum omega_a rho_a."""
+    weights = box.box_weights(mesh, low, high, case.nodes.source == "lattice", d.share.ranks)
     return np.where(d.share.halo.owned, weights[d.share.nodes], 0.0)

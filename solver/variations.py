@@ -21,7 +21,6 @@ from .case import (
     wrong_dimensions,
 )
 
-
 MOST = 500  # tables that are remembered before all are forgotten: those that come back soon are worth it
 
 

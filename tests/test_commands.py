@@ -207,16 +207,3 @@ def test_schema_describes_the_case_that_runs(folder: Path) -> None:
         if isinstance(values, dict):
             properties = schema["$defs"][schema["properties"][table]["$ref"].rpartition("/")[2]]["properties"]
             assert set(values) <= set(properties)
-
-
-def test_a_packing_to_be_made_is_refused(tmp_path: Path) -> None:
-    """The schema knows packings, the solver cannot make them yet: it says so instead of running anything."""
-    case = tmp_path / "packing.toml"
-    case.write_text(
-        '[domain]\nsize = [60.0, 40.0]\n[nodes]\nsource = "lattice"\nspacing = 1.0\n[time]\nend = 1.0\n'
-        '[particles]\nsource = "packing"\nmean_radius = 5.0\ncount = 5\ncontainer = [[5.0, 5.0], [55.0, 35.0]]\n'
-    )
-    command = [sys.executable, "-P", "-m", "frit.solver", str(case), "--out", str(tmp_path / "out")]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 2
-    assert "particles.source = 'packing': is not there yet; allowed: list, file" in ended.stderr

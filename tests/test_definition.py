@@ -94,7 +94,7 @@ def test_a_base_file_is_read_and_paths_start_where_they_are_written(tmp_path: Pa
 
 def test_without_a_file_the_base_cannot_be_a_path(tmp_path: Path) -> None:
     (tmp_path / "case.json").write_text(json.dumps(base()))
-    with pytest.raises(CaseError, match="base = '.*case.json': must be a table"):
+    with pytest.raises(CaseError, match=r"base = '.*': must be a table"):
         parse_sweep({"base": str(tmp_path / "case.json")})
 
 
@@ -129,8 +129,8 @@ BAD: list[tuple[Tree, str, str]] = [
     ({"axes": {"particles.mean_radius": {"low": 5, "high": 9}}}, RADIUS, "needs sample.method = random, lhs, sobol"),
     ({"axes": {"particles.mean_radius": {"low": 9, "high": 9}}}, f"{RADIUS}.high = 9.0", "greater than low, 9.0"),
     ({"axes": {"particles.mean_radius": {"low": 9}}}, f"{RADIUS}.high: ", "must be given: largest value"),
-    ({"axes": {"model.A": {"low": 0, "high": 9, "log": True}}}, 'axes."model.A".low = 0.0', "greater than 0 with log"),
-    ({"axes": {"model.advection": {"linspace": [1, 2, 3]}}}, "axes.", "must be a list of values: model.advection is not"),
+    ({"axes": {"model.A": {"low": 0, "high": 9, "log": True}}}, 'axes."model.A".low = 0.0', "greater than 0 with"),
+    ({"axes": {"model.advection": {"linspace": [1, 2, 3]}}}, "axes.", "a list of values: model.advection is not"),
     (
         {"axes": {"particles.count": {"low": 1.5, "high": 9}}, "sample": {"method": "lhs", "points": 3}},
         'axes."particles.count"',
@@ -174,7 +174,7 @@ def test_unreadable_files_are_refused_as_cases_are(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text('base = "no.toml"')
     with pytest.raises(CaseError, match=r"no.toml: cannot be read"):
         load_sweep(tmp_path / "s.toml")
-    with pytest.raises(CaseError, match="must end in .toml or .json"):
+    with pytest.raises(CaseError, match=r"must end in .toml or .json"):
         load_sweep(tmp_path / "s.yaml")
 
 

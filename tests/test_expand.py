@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from frit.sweeps.expand import MOST_REFUSED, Expansion, count, expand
 
 Tree = dict[str, Any]
 
-PACKING = {
+PACKING: Tree = {
     "domain": {"size": [100, 100]},
     "nodes": {"spacing": 1},
     "particles": {"source": "packing", "mean_radius": 8.0, "packing_density": 0.4, "container": [[5, 5], [95, 95]]},
@@ -357,4 +356,4 @@ def test_memory_of_tables_is_bounded_and_forgetting_changes_nothing() -> None:
     assert len(found.points) == 2 * n
     for point in (*found.points[:3], *found.points[498:503], *found.points[-3:]):
         assert parse_case(json.loads(point.case)).identity() == point.identity
-    assert all(a[RADIUS] <= b[RADIUS] for a, b in pairwise(point.parameters for point in found.points))
+    assert values(found, A) == [(8.0,), (16.0,)] * n

@@ -20,6 +20,7 @@ from frit.service.files import read_json, start_of, write_json
 from frit.service.jobs import Job, Move, State
 from frit.service.launch import Outcome
 from frit.service.runner import Order, judge, read_exit
+from frit.service.store import Store
 
 
 @pytest.fixture
@@ -215,10 +216,6 @@ def test_runners_outlive_the_service_and_are_adopted(tmp_path: Path, how: signal
     data = tmp_path / "data"
     command = [sys.executable, "-P", "-c", ENGINE, str(data), str(Path(__file__).parent)]
 
-    async def before() -> list[Job]:
-        async with Engine(settings(data)) as engine:
-            return await submit(engine, new_job("sleep 30"), new_job("sleep 1.0", 0.1))
-
     async def after(jobs: list[Job], pid: int) -> None:
         async with Engine(settings(data)) as engine:
             (short,) = await ended(engine, jobs[1])
@@ -232,7 +229,10 @@ def test_runners_outlive_the_service_and_are_adopted(tmp_path: Path, how: signal
             assert len((engine.run_directory(long.id) / "calls").read_text().splitlines()) == 1
             assert [a.number for a in engine.store.attempts(long.id)] == [1]
 
-    jobs = asyncio.run(before())
+    data.mkdir()
+    store = Store(data)
+    jobs = [store.submit(job).result() for job in (new_job("sleep 30"), new_job("sleep 1.0", 0.1))]
+    store.close()
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     with process.stdout:
@@ -247,6 +247,22 @@ def test_runners_outlive_the_service_and_are_adopted(tmp_path: Path, how: signal
     while not (directories[1] / "exit.json").exists():
         assert psutil.pid_exists(pid)
     asyncio.run(after(jobs, pid))
+
+
+@pytest.mark.usefixtures("standing_in")
+def test_a_job_claimed_by_a_service_that_died_at_once_is_started_by_the_next(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Engine(settings(tmp_path / "data")) as engine:
+            (job,) = await ended(engine, job_)
+            assert (job.state, job.attempt, job.failures) == (State.SUCCEEDED, 2, 0)
+            assert len((engine.run_directory(job.id) / "calls").read_text().splitlines()) == 1
+
+    (tmp_path / "data").mkdir()
+    store = Store(tmp_path / "data")
+    job_ = store.submit(new_job("sleep 0")).result()
+    store.claim([(job_.seq, (0,))]).result()
+    store.close()
+    asyncio.run(main())
 
 
 @pytest.mark.usefixtures("standing_in")

@@ -2,6 +2,7 @@
 
 import asyncio
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import sqlalchemy as sa
@@ -11,7 +12,7 @@ from serving import ended, in_state, new_job, settings, stand_in, submit, until
 
 from frit.service.engine import Engine, EngineError
 from frit.service.jobs import State
-from frit.service.scheduler import choose
+from frit.service.scheduler import Scheduler, choose
 from frit.service.settings import own_cores
 
 queues = st.lists(st.integers(1, 9), max_size=20).map(lambda ranks: list(enumerate(ranks)))
@@ -140,15 +141,18 @@ def test_a_tick_costs_one_query(tmp_path: Path) -> None:
             statements: list[str] = []
             for database in (engine.store._reader, engine.store._writer):
                 sa.event.listen(database, "before_cursor_execute", lambda *a: statements.append(a[2]))
-            await engine.scheduler.tick()
-            assert statements == []  # there is no free core
-            engine.scheduler.free = {0}
-            engine.scheduler.open = True
-            engine.store.claim = lambda choices: (_ for _ in ()).throw(KeyboardInterrupt)  # type: ignore[method-assign]
-            with pytest.raises(KeyboardInterrupt):
-                await engine.scheduler.tick()
-            assert len([text for text in statements if text.startswith("SELECT")]) == 1
-            engine.scheduler.free = set()
+            own = engine.scheduler  # another one beside it, which nobody runs
+            idle = Scheduler(own.settings, engine.store, engine.hub, own.backend, own.follower)
+            idle.free = set()
+            await idle.tick()
+            assert statements == []
+            idle.free = {0}
+            with (
+                patch.object(engine.store, "claim", side_effect=LookupError("asked for a claim")),
+                pytest.raises(LookupError),
+            ):
+                await idle.tick()
+            assert [text.split()[0] for text in statements] == ["BEGIN", "SELECT"]
             await engine.cancel(running.id)
 
     asyncio.run(main())

@@ -1,5 +1,6 @@
 """Versions of the index. An empty one is made by whoever opens it; an old one waits for `frit db upgrade`."""
 
+import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -25,8 +26,12 @@ def configuration(path: Path) -> Config:
 
 
 def versions(path: Path) -> tuple[str | None, str]:
-    """The version of the index at `path` (None: empty or not there), and this frit's."""
-    newest = ScriptDirectory.from_config(configuration(path)).get_current_head()
+    """The version of the index at `path` (None: empty or not there), and this frit's.
+
+    Raises `IndexVersionError` for what is no index, and for the index of a newer frit.
+    """
+    scripts = ScriptDirectory.from_config(configuration(path))
+    newest = scripts.get_current_head()
     assert newest is not None  # narrows the type: there is a first migration
     if not path.exists():
         return None, newest
@@ -35,11 +40,16 @@ def versions(path: Path) -> tuple[str | None, str]:
             present = MigrationContext.configure(connection).get_current_revision()
             if present is None and sa.inspect(connection).get_table_names():
                 raise IndexVersionError(f"{path}: a database, but not an index of frit")
-            return present, newest
     except sa.exc.DatabaseError as error:
         if isinstance(error.orig, sqlite3.OperationalError):
             raise IndexVersionError(f"{path}: cannot be opened: {error.orig}") from error
-        raise IndexVersionError(f"{path}: not a database: {error.orig}") from error
+        way = f"`frit reindex --data {path.parent}` makes a new one from the run directories"
+        raise IndexVersionError(f"{path}: not a database: {error.orig}: {way}") from error
+    if present is not None and present not in {script.revision for script in scripts.walk_revisions()}:
+        raise IndexVersionError(
+            f"{path}: version {present}, this frit needs {newest}: a newer frit made it: use that one"
+        )
+    return present, newest
 
 
 def prepare(path: Path) -> None:
@@ -48,19 +58,34 @@ def prepare(path: Path) -> None:
     if present is None:
         upgrade(path)
     elif present != newest:
-        known = {script.revision for script in ScriptDirectory.from_config(configuration(path)).walk_revisions()}
-        way = f"`frit db upgrade --data {path.parent}`" if present in known else "a newer frit made it: use that one"
+        way = f"`frit db upgrade --data {path.parent}`"
         raise IndexVersionError(f"{path}: version {present}, this frit needs {newest}: {way}")
 
 
 def upgrade(path: Path) -> Path | None:
-    """Bring the index to this frit's version in one transaction; an older one is copied first: where to, if so."""
+    """Bring the index to this frit's version in one transaction; an older one is copied first: where to, if so.
+
+    Raises `IndexVersionError`; then the index is what it was.
+    """
     present, newest = versions(path)
-    copy = None
-    if present is not None and present != newest:
-        copy = path.with_name(f"{path.name}.{present}")
-        with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(copy)) as target:
-            source.backup(target)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    command.upgrade(configuration(path), "head")
+    try:
+        copy = keep(path, present) if present not in (None, newest) else None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        command.upgrade(configuration(path), "head")
+    except (sa.exc.DatabaseError, sqlite3.Error, OSError) as error:
+        words = getattr(error, "orig", error)
+        raise IndexVersionError(f"{path}: cannot be brought to version {newest}: {words}") from error
+    return copy
+
+
+def keep(path: Path, version: str | None) -> Path:
+    """A durable copy beside the index, what its log holds included."""
+    copy = path.with_name(f"{path.name}.{version}")
+    beside = copy.with_name(f"{copy.name}.new")
+    beside.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(beside)) as target:
+        source.backup(target)
+    with open(beside, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(beside, copy)
     return copy

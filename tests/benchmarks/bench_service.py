@@ -45,8 +45,8 @@ def load(port: int, posts: int, connections: int, answers: Any) -> None:
 
     async def one(count: int, body: bytes) -> list[float]:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        fields = f"Host: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
-        head = f"POST /v1/jobs HTTP/1.1\r\n{fields}\r\n\r\n"
+        lines = ("Host: 127.0.0.1", "Content-Type: application/json", f"Content-Length: {len(body)}", "", "")
+        head = "\r\n".join(("POST /v1/jobs HTTP/1.1", *lines))
         times = []
         for _ in range(count):
             start = time.perf_counter()

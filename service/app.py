@@ -53,7 +53,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     metrics.expose(app, engine, dependencies=[Depends(needs("read"))], tags=["service"], responses=PROBLEMS(401, 403))
     app.add_middleware(Gate, settings=settings, store=lambda: engine().store)
-    openapi.complete(app)
+    openapi.complete(app, settings.cores)
     return app
 
 

@@ -131,7 +131,7 @@ def _keys() -> dict[str, Any]:
 FILTERS = _filters()
 
 
-def complete(app: FastAPI) -> None:
+def complete(app: FastAPI, cores: int) -> None:
     """Add what the routes do not say to the document, once it is asked for."""
     plain = app.openapi
 
@@ -141,6 +141,9 @@ def complete(app: FastAPI) -> None:
             schemas = schema["components"]["schemas"]
             details = ProblemDetails.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= details.pop("$defs", {}) | {"ProblemDetails": details}
+            ranks = schemas["JobSubmission"]["properties"]["ranks"]
+            for form in (ranks, schemas["SweepSubmission"]["properties"]["ranks"]["anyOf"][0]):
+                form["maximum"] = cores
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)
             schema["components"]["securitySchemes"] = {"token": TOKEN}

@@ -16,6 +16,8 @@ from schemathesis.checks import not_a_server_error
 from frit.service import tokens
 from frit.service.app import create_app
 
+SWEEP = {"name": "s", "base": PACKING, "axes": {"particles.mean_radius": [8.0, 10.0]}}
+
 
 class Known:
     """What a module's tests ask about: set by the fixture, read by the hook."""
@@ -31,8 +33,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder: Path = tmp_path_factory.mktemp("data")
     with listening(folder, body_limit=200_000, nodes_limit=100_000, points_limit=50) as found:
         Known.job = httpx2.post(f"{found}/v1/jobs", json={"case": TINY}).json()["id"]
-        definition = {"name": "s", "base": PACKING, "axes": {"particles.mean_radius": [8.0, 10.0]}}
-        Known.sweep = httpx2.post(f"{found}/v1/sweeps", json={"definition": definition}).json()["id"]
+        Known.sweep = httpx2.post(f"{found}/v1/sweeps", json={"definition": SWEEP}).json()["id"]
         Known.secret = tokens.create(folder, "all", "submit")
         yield found
 
@@ -59,6 +60,25 @@ def map_query(context: Any, query: Any) -> Any:
         if "observable" in query:
             query["observable"] = "neck_length"
     return query
+
+
+@schema.hook
+def map_body(context: Any, body: Any) -> Any:
+    """What is possible within a case, a sweep or a file no schema says: these are good, all else is generated."""
+    if not isinstance(body, dict):
+        return body
+    good = {"case": TINY, "definition": SWEEP}
+    body = {key: good[key] if key in good and isinstance(value, dict) else value for key, value in body.items()}
+    files = body.get("files")
+    if isinstance(files, dict) and all(map(is_file, files.values())):
+        body["files"] = {}
+    return body
+
+
+def is_file(content: Any) -> bool:
+    """Whether it is one by its schema."""
+    known = isinstance(content, dict) and content.keys() <= {"content", "encoding"}
+    return known and isinstance(content.get("content"), str) and content.get("encoding", "text") in ("text", "base64")
 
 
 @schema.parametrize()

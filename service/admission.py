@@ -191,7 +191,7 @@ def _paths(tree: Any, key: str = "", place: str = "") -> Iterator[tuple[str, str
     """
     if isinstance(tree, Mapping) and place.count("/") < DEPTH:
         for name, value in tree.items():
-            if isinstance(value, str | Mapping | list):
+            if isinstance(value, dict | list) or (isinstance(value, str) and str(name).endswith("path")):
                 yield from _paths(value, str(name), f"{place}/{escaped(str(name))}")
     elif isinstance(tree, list):
         for number, value in enumerate(tree):

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import BaseModel
 
 from . import admission, delivery, filters, metrics, openapi, stream, views
 from .comparison import ObservableError, compare
@@ -52,7 +53,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     metrics.expose(app, engine, dependencies=[Depends(needs("read"))], tags=["service"], responses=PROBLEMS(401, 403))
     app.add_middleware(Gate, settings=settings, store=lambda: engine().store)
-    openapi.complete(app)
+    openapi.complete(app, settings.cores)
     return app
 
 
@@ -77,23 +78,16 @@ async def _sweep(request: Request, id: Annotated[str, Path(max_length=200, descr
     return running(request).store.sweep(id)
 
 
-async def _key(
-    request: Request,
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+( +[\x21-\x7e]+)*$",
-            description="The same key with the same request gives what it gave, and does nothing twice.",
-        ),
-    ] = None,
-) -> str | None:  # fmt: skip
-    return idempotency_key
-
-
 TheEngine = Annotated[Engine, Depends(_engine)]
 TheJob = Annotated[Job, Depends(_job)]
 TheSweep = Annotated[SweepRecord, Depends(_sweep)]
-GivenKey = Annotated[str | None, Depends(_key)]
+GivenKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+( +[\x21-\x7e]+)*$",
+        description="The same key with the same request gives what it gave, and does nothing twice.",
+    ),
+]  # fmt: skip
 
 
 def key_of(value: str | None, who: str, route: str, request: Any) -> Key | None:
@@ -115,20 +109,23 @@ def job_view(engine: Engine, job: Job) -> views.JobView:
     return views.detail(job, hidden(engine), attempts, engine.progress(job.id))
 
 
-def located(response: Response, address: str) -> None:
-    """Where the new thing is."""
-    response.headers["Location"] = address
+def made(view: BaseModel, address: str) -> Response:
+    """201, and where the new thing is."""
+    return Response(view.model_dump_json(), 201, {"Location": address}, "application/json")
 
 
 # --- jobs -------------------------------------------------------------------------------------------------
 
 
-@api.post("/jobs", status_code=201, tags=["jobs"], responses=openapi.created(401, 403, 413, 415, 422, 429, 503))
+@api.post(
+    "/jobs", status_code=201, tags=["jobs"], response_model=views.JobView,
+    responses=openapi.created(401, 403, 413, 415, 422, 429, 503),
+)  # fmt: skip
 async def submit_job(
-    submission: views.JobSubmission, request: Request, response: Response, engine: TheEngine, who: Submitter,
-    given: GivenKey,
-) -> views.JobView:  # fmt: skip
+    submission: views.JobSubmission, request: Request, who: Submitter, given: GivenKey = None
+) -> Response:
     """Queue a case. Every request makes a job, also of a case that was run before; see Idempotency-Key."""
+    engine = running(request)
     store = engine.store
     key = key_of(given, who, "POST /v1/jobs", submission.model_dump(mode="json") if given else None)
     if key is not None and (before := store.known(key)) is not None:
@@ -141,8 +138,7 @@ async def submit_job(
             new = admission.job_of(submission, engine.settings)
         request.app.state.queue.admit(1)
         job = await asyncio.wrap_future(store.submit(new, key))
-    located(response, f"/v1/jobs/{job.id}")
-    return job_view(engine, job)
+    return made(job_view(engine, job), f"/v1/jobs/{job.id}")
 
 
 @api.get("/jobs", tags=["jobs"], responses=PROBLEMS(401, 403, 404, 422, 503), openapi_extra=openapi.FILTERS)
@@ -239,14 +235,14 @@ async def read_zarr(request: Request, engine: TheEngine, who: Reader, job: TheJo
 
 
 @api.post("/jobs/{id}/cancel", tags=["jobs"], responses=PROBLEMS(401, 403, 404, 409, 413, 415, 422, 503))
-async def cancel_job(engine: TheEngine, who: Submitter, job: TheJob, given: GivenKey) -> views.JobView:
+async def cancel_job(engine: TheEngine, who: Submitter, job: TheJob, given: GivenKey = None) -> views.JobView:
     """End a job: at once where it has no cores, else its ranks write a checkpoint first (`stopping` until then)."""
     key = key_of(given, who, "POST /v1/jobs/cancel", job.id)
     return job_view(engine, await engine.cancel(job.id, key))
 
 
 @api.post("/jobs/{id}/retry", tags=["jobs"], responses=PROBLEMS(401, 403, 404, 409, 413, 415, 422, 503))
-async def retry_job(engine: TheEngine, who: Submitter, job: TheJob, given: GivenKey) -> views.JobView:
+async def retry_job(engine: TheEngine, who: Submitter, job: TheJob, given: GivenKey = None) -> views.JobView:
     """Queue a job that ended without success again; it goes on from its last checkpoint."""
     key = key_of(given, who, "POST /v1/jobs/retry", job.id)
     return job_view(engine, await asyncio.wrap_future(engine.store.retry(job.id, key)))
@@ -255,11 +251,13 @@ async def retry_job(engine: TheEngine, who: Submitter, job: TheJob, given: Given
 # --- sweeps -----------------------------------------------------------------------------------------------
 
 
-@api.post("/sweeps", status_code=201, tags=["sweeps"], responses=openapi.created(401, 403, 413, 415, 422, 429, 503))
+@api.post(
+    "/sweeps", status_code=201, tags=["sweeps"], response_model=views.SweepView,
+    responses=openapi.created(401, 403, 413, 415, 422, 429, 503),
+)  # fmt: skip
 async def submit_sweep(
-    submission: views.SweepSubmission, request: Request, response: Response, engine: TheEngine, who: Submitter,
-    given: GivenKey,
-) -> views.SweepView:  # fmt: skip
+    submission: views.SweepSubmission, request: Request, engine: TheEngine, who: Submitter, given: GivenKey = None
+) -> Response:
     """Queue the points of a sweep that no job has yet; the others are shared with the jobs there are."""
     store = engine.store
     key = key_of(given, who, "POST /v1/sweeps", submission.model_dump(mode="json") if given else None)
@@ -270,8 +268,8 @@ async def submit_sweep(
         request.app.state.queue.admit(len(new.points))
         queued = store.submit_sweep(new.name, new.definition, new.points, new.duplicates, key)
         sweep = await asyncio.wrap_future(queued)
-    located(response, f"/v1/sweeps/{sweep.id}")
-    return views.sweep_view(sweep, store.new_in_sweeps([sweep.seq])[sweep.seq])
+    view = views.sweep_view(sweep, store.new_in_sweeps([sweep.seq])[sweep.seq])
+    return made(view, f"/v1/sweeps/{sweep.id}")
 
 
 @api.get("/sweeps", tags=["sweeps"], responses=PROBLEMS(401, 403, 422, 503))

@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from . import filters
 from .jobs import State
 from .problems import MEDIA_TYPE, ProblemDetails
+from .security import OPEN
 
 DESCRIPTION = """Runs sintering cases and sweeps of them, and keeps what they give findable.
 
@@ -31,6 +32,10 @@ TITLES = {
     503: "The index cannot be used now",
 }
 RETRY = {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer"}}}
+TOKEN = {
+    "type": "http", "scheme": "bearer",
+    "description": "`frit token create` makes one. Needed as soon as one is active.",
+}  # fmt: skip
 READING = (401, 403, 404, 503)
 Responses = dict[int | str, dict[str, Any]]
 
@@ -96,12 +101,12 @@ def _filters() -> dict[str, Any]:
     """Query parameters of the list of jobs."""
     one = f"({'|'.join(State)})"
     states = {"type": "string", "pattern": f"^{one}(,{one})*$", "example": "queued,running"}
-    orders = [f"{sign}{key}" for key in filters.known() for sign in ("", "-")]
+    orders = f"^-?({'|'.join(key.replace('.', '[.]') for key in filters.known())})$"
     named: list[tuple[str, dict[str, Any], str]] = [
         ("state", states, "Jobs in one of these states."),
         ("sweep", {"type": "string"}, "Jobs of a sweep, by its id or name."),
         ("tag", {"type": "string"}, "Jobs with a tag."),
-        ("order", {"type": "string", "enum": orders, "default": "-created"}, "A key; - before it: the largest first."),
+        ("order", {"type": "string", "pattern": orders, "default": "-created"}, "A key; -: the largest first."),
         ("limit", {"type": "integer", "minimum": 1, "maximum": filters.LARGEST_PAGE}, "Jobs on the page."),
         ("cursor", {"type": "string"}, "From `next` of the page before."),
     ]
@@ -111,7 +116,7 @@ def _filters() -> dict[str, Any]:
     ]
     free = {
         "name": "filters", "in": "query", "required": False, "style": "form", "explode": True,
-        "description": "`key=value` or `key.operator=value`; keys are those below.",
+        "description": f"`key=value` or `key.operator=value`; keys: {', '.join(filters.known())}.",
         "schema": {"type": "object", "properties": _keys(), "additionalProperties": False},
         "example": {"particles.mean_radius.ge": 9, "result.vacancy_ratio.le": 0.1},
     }  # fmt: skip
@@ -119,22 +124,14 @@ def _filters() -> dict[str, Any]:
 
 
 def _keys() -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, scalar in filters.known().items():
-        if key == "state":
-            continue
-        numeric = scalar.kind in ("number", "integer", "time")
-        limits = {"minimum": -1e300, "maximum": 1e300} if numeric else {}
-        plain = {"type": "number" if numeric else scalar.kind, **limits}
-        for verb in ("", ".ne", *(f".{verb}" for verb in filters.ORDERING if numeric)):
-            found[key + verb] = plain
-    return found
+    """The keys that an index has, with the operators that mean most."""
+    return {f"{key}{verb}": {"type": "number"} for key in filters.INDEXED for verb in ("", ".le", ".ge")}
 
 
 FILTERS = _filters()
 
 
-def complete(app: FastAPI) -> None:
+def complete(app: FastAPI, cores: int) -> None:
     """Add what the routes do not say to the document, once it is asked for."""
     plain = app.openapi
 
@@ -144,20 +141,24 @@ def complete(app: FastAPI) -> None:
             schemas = schema["components"]["schemas"]
             details = ProblemDetails.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= details.pop("$defs", {}) | {"ProblemDetails": details}
+            ranks = schemas["JobSubmission"]["properties"]["ranks"]
+            for form in (ranks, schemas["SweepSubmission"]["properties"]["ranks"]["anyOf"][0]):
+                form["maximum"] = cores
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)
-            for path in schema["paths"].values():
-                for operation in path.values():
+            schema["components"]["securitySchemes"] = {"token": TOKEN}
+            for path, operations in schema["paths"].items():
+                for operation in operations.values():
                     _complete(operation)
+                    if path not in OPEN:
+                        operation["security"] = [{"token": []}, {}]
         return app.openapi_schema or {}
 
     app.openapi = document  # type: ignore[method-assign]
 
 
 def _complete(operation: dict[str, Any]) -> None:
-    """Errors are problems everywhere; a token is needed only where there are tokens."""
+    """Errors are problems everywhere."""
     for status, response in operation["responses"].items():
         if "application/json" in response.get("content", {}) and status == "422":
             response["content"] = problems(422)[422]["content"]
-    if "security" in operation:
-        operation["security"] = [*operation["security"], {}]

@@ -10,17 +10,17 @@ from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .problems import HttpError, as_problem
 from .settings import Settings
-from .store import Store, StoreError
+from .store import Store, StoreError, Token
 from .tokens import allows, digest
 
 LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+TOKENS = "frit.tokens"  # of a request's scope: those that count while it is answered
 OPEN = ("/livez", "/readyz")  # they tell nothing: health checks need neither token nor name
 
 
@@ -84,7 +84,10 @@ class Gate:
         posted = scope["method"] not in ("GET", "HEAD", "OPTIONS")
         if posted:
             self._check_body(headers)
-        if scope["path"] not in OPEN and not self.store().active_tokens():
+        if scope["path"] in OPEN:
+            return
+        scope[TOKENS] = active = self.store().active_tokens()
+        if not active:
             check_host(headers, self.settings)
             if posted:
                 check_origin(headers)
@@ -126,26 +129,24 @@ def check_origin(headers: Headers) -> None:
         raise HttpError(403, "cross-site", "A request from another site", detail)
 
 
-bearer = HTTPBearer(auto_error=False, description="`frit token create` makes one. Needed as soon as one is active.")
-Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
-
-
 def needs(scope: str) -> Callable[..., Awaitable[str]]:
     """A dependency that gives the name of the token, "-" where there are no tokens and so no names."""
 
-    async def check(request: Request, credentials: Credentials) -> str:
-        active = request.app.state.engine.store.active_tokens()
+    async def check(request: Request) -> str:
+        active: dict[str, Token] = request.scope[TOKENS]
         if not active:
             return "-"
-        given = None if credentials is None else active.get(digest(credentials.credentials))
+        kind, _, secret = request.headers.get("authorization", "").partition(" ")
+        bearer = kind.lower() == "bearer"
+        given = active.get(digest(secret.strip())) if bearer else None
         if given is None:
-            detail = "a bearer token is needed" if credentials is None else "the token is unknown or revoked"
+            detail = "the token is unknown or revoked" if bearer else "a bearer token is needed"
             challenge = {"WWW-Authenticate": 'Bearer realm="frit"'}
             raise HttpError(401, "unauthorized", "Who are you?", detail, headers=challenge)
         if not allows(given.scope, scope):
             detail = f"token {given.name!r} has scope {given.scope}, this needs {scope}"
             raise HttpError(403, "forbidden", "The token does not allow this", detail)
-        return str(given.name)
+        return given.name
 
     return check
 

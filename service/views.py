@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from .jobs import Job, State
 from .store import Attempt, SweepRecord
@@ -32,9 +32,10 @@ EXAMPLE_SWEEP: dict[str, Any] = {
 
 Text = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Tag = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f]+$")]
-Priority = Annotated[int, Field(strict=True, ge=-1_000_000, le=1_000_000)]
-Ranks = Annotated[int, Field(strict=True, ge=1, le=1_000_000)]
-Limit = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+WHOLE = BeforeValidator(lambda value: int(value) if isinstance(value, float) and value.is_integer() else value)
+Priority = Annotated[int, Field(strict=True, ge=-1_000_000, le=1_000_000), WHOLE]
+Ranks = Annotated[int, Field(strict=True, ge=1, le=1_000_000), WHOLE]
+Limit = Annotated[float, Field(strict=True, gt=0, le=1e9, allow_inf_nan=False)]
 
 
 class Body(BaseModel):

@@ -188,7 +188,7 @@ def test_nothing_is_lost_or_submitted_twice_while_the_service_restarts(tmp_path:
         try:
             for number in (signal.SIGKILL, signal.SIGTERM):
                 before = len(done)
-                until(lambda before=before: len(done) > before + 5)  # type: ignore[misc]
+                until(lambda before=before: len(done) > before + 5)
                 server.end(number)
                 server.start()
             threads[1].join()

@@ -230,7 +230,7 @@ def test_no_parameter_breaks_the_query(store: Store, name: str, value: str) -> N
         store.page(selection.where, selection.order, selection.limit, None)
 
 
-@given(st.text(alphabet="ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_=", max_size=60))
+@given(st.text(alphabet="ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_=", min_size=1, max_size=60))
 @settings(max_examples=100, deadline=None)
 def test_no_cursor_breaks_the_query(text: str) -> None:
     with pytest.raises(HttpError):

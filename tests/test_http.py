@@ -58,7 +58,7 @@ def done(busy: str) -> Tree:
 
 def post(client: TestClient, path: str, body: Tree | None = None, key: str | None = None) -> httpx2.Response:
     headers = {} if key is None else {"Idempotency-Key": key}
-    return client.post(path, json=body, headers=headers)  # type: ignore[return-value]
+    return client.post(path, json=body, headers=headers)
 
 
 def problem(response: Any, status: int) -> Tree:

@@ -199,6 +199,14 @@ def test_random_close_packing_of_equal_discs() -> None:
 
 
 @pytest.mark.slow
+def test_equal_discs_with_friction_pack_at_random() -> None:
+    """0.82 to 0.86: a friction of 0.3 keeps poured equal discs from ordering."""
+    size = [50.0, 50.0]
+    fractions = [core(packed(size, count=560, friction=0.3, seed=seed), size, 6.0) for seed in range(4)]
+    assert 0.82 < np.mean(fractions) < 0.86
+
+
+@pytest.mark.slow
 def test_equal_discs_pack_at_random_and_crystallise_when_poured() -> None:
     """A random pack of 0.82 exists; without friction gravity orders equal discs, up to 0.907 (hexagonal)."""
     packed([50.0, 50.0], packing_density=0.82)

@@ -10,11 +10,12 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from frit.solver.case import Case, CaseError, Problem, parse_case
-from frit.solver.variations import case_text, identity, written
+from frit.solver.case import Case, CaseError, Particles, Problem, Table, parse_case
+from frit.solver.variations import Texts, case_text, identity, written
 from frit.sweeps.definition import parse_sweep
 from frit.sweeps.expand import expand
 
@@ -40,12 +41,22 @@ def job_of(submission: JobSubmission, settings: Settings) -> NewJob:
         raise refused_case(uploads.hide(error), "/case") from None
     if (nodes := estimated_nodes(case.domain.size, case.nodes.spacing)) > settings.nodes_limit:
         raise too_many_nodes(nodes, settings, "/case/nodes/spacing", case.nodes.spacing)
-    texts = {name: written(table) for name, table in case.tables().items()}
+    texts = {name: texts_of(table) for name, table in case.tables().items()}
     return NewJob(
         case=case_text(case.name, texts), identity=identity(texts), ranks=submission.ranks,
         priority=submission.priority, tags=tuple(submission.tags), time_limit=submission.time_limit,
         name=case.name if submission.name is None else submission.name,
     )  # fmt: skip
+
+
+def texts_of(table: Table) -> Texts:
+    """The table as JSON; most requests have most tables in common. A mesh is known by a path that names its content."""
+    return written(table) if isinstance(table, Particles) else _known(table)
+
+
+@lru_cache(maxsize=256)
+def _known(table: Table) -> Texts:
+    return written(table)
 
 
 def checked(tree: Tree) -> Case:

@@ -19,6 +19,7 @@ Url = Annotated[str, typer.Option("--url", envvar="FRIT_URL", metavar="URL", hel
 Secret = Annotated[str | None, typer.Option("--token", envvar="FRIT_TOKEN", help="Access token of the service.")]
 JobId = Annotated[str, typer.Argument(metavar="ID", help="Of the job, or the beginning of it.")]
 HERE = "http://127.0.0.1:8000"
+STREAMS_END = 2  # seconds for open streams, when the service ends
 CURVES = (".png", ".pdf", ".svg")
 
 
@@ -33,6 +34,7 @@ def serve(
     cores: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processors for jobs; default: all.")] = None,
     host: Annotated[str, typer.Option(envvar="FRIT_HOST", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(envvar="FRIT_PORT", min=0, max=65535, help="0: any free one.")] = 8000,
+    access_log: Annotated[bool, typer.Option("--access-log", help="A line on stderr per request.")] = False,
 ) -> None:
     """Serve jobs over HTTP. Ending the service leaves its jobs running; the next one takes them up again."""
     import uvicorn
@@ -52,7 +54,10 @@ def serve(
     except (EngineError, AddressError) as error:
         refuse(str(error))
     typer.echo(f"frit serves {settings.data.absolute()} with {settings.cores} cores", err=True)
-    uvicorn.run(create_app(settings), host=host, port=port, log_level="info", server_header=False)
+    uvicorn.run(
+        create_app(settings), host=host, port=port, access_log=access_log, server_header=False,
+        timeout_graceful_shutdown=STREAMS_END,
+    )  # fmt: skip
 
 
 def submit(

@@ -55,7 +55,7 @@ class Run:
         return xr.open_dataset(self.directory / "snapshots.zarr", engine="zarr", chunks=None)
 
     def row(self) -> dict[str, Any]:
-        """Job, name, state, ranks, every scalar of the case, and the last row of the history."""
+        """Job, name, state, ranks, every scalar of the case, what its packing realised, the last row of the history."""
         about = {"job": self.job, "name": self.case["name"]} | {key: self.record.get(key) for key in ("state", "ranks")}
         scalars = {
             _column(table, key): value
@@ -64,7 +64,9 @@ class Run:
             for key, value in values.items()
             if isinstance(value, str | int | float)
         }
-        return about | scalars | {key: column[-1] for key, column in self.history.items()}
+        packing = self.record.get("packing") or {}
+        realised = {f"realised_{key}": value for key, value in packing.items() if isinstance(value, str | int | float)}
+        return about | scalars | realised | {key: column[-1] for key, column in self.history.items()}
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -38,6 +38,8 @@ def create_app(settings: Settings) -> FastAPI:
             app.state.engine = engine
             app.state.queue = admission.QueueLimit(engine.store, settings.queue_limit)
             yield
+            if settings.release:
+                await engine.scheduler.release()
 
     app = FastAPI(
         title="frit", version=openapi.version(), description=openapi.DESCRIPTION, lifespan=lifespan,

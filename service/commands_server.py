@@ -19,8 +19,8 @@ Url = Annotated[str, typer.Option("--url", envvar="FRIT_URL", metavar="URL", hel
 Secret = Annotated[str | None, typer.Option("--token", envvar="FRIT_TOKEN", help="Access token of the service.")]
 JobId = Annotated[str, typer.Argument(metavar="ID", help="Of the job, or the beginning of it.")]
 HERE = "http://127.0.0.1:8000"
-STREAMS_END = 2  # seconds for open streams, when the service ends
 CURVES = (".png", ".pdf", ".svg")
+LINGER = 3  # seconds for open answers when the service ends; a stream of events has no end of its own
 
 
 def add_to(app: typer.Typer) -> None:
@@ -35,8 +35,14 @@ def serve(
     host: Annotated[str, typer.Option(envvar="FRIT_HOST", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(envvar="FRIT_PORT", min=0, max=65535, help="0: any free one.")] = 8000,
     access_log: Annotated[bool, typer.Option("--access-log", help="A line on stderr per request.")] = False,
+    release: Annotated[
+        bool | None, typer.Option("--release/--leave", help="At the end: stop running jobs, with a checkpoint.")
+    ] = None,
 ) -> None:
-    """Serve jobs over HTTP. Ending the service leaves its jobs running; the next one takes them up again."""
+    """Serve jobs over HTTP. Ending the service leaves its jobs running; the next one takes them up again.
+
+    With --release (or FRIT_RELEASE=1) they write a checkpoint, end and wait in the queue: where nothing outlives it.
+    """
     import uvicorn
     from pydantic import ValidationError
 
@@ -45,7 +51,8 @@ def serve(
     from .security import AddressError
     from .settings import Settings
 
-    given = {"data": data, "host": host, "port": port, **({} if cores is None else {"cores": cores})}
+    chosen = {"cores": cores, "release": release}
+    given = {"data": data, "host": host, "port": port, **{k: v for k, v in chosen.items() if v is not None}}
     try:
         settings = Settings.model_validate(Settings().model_dump() | given)
         check(settings)
@@ -56,7 +63,7 @@ def serve(
     typer.echo(f"frit serves {settings.data.absolute()} with {settings.cores} cores", err=True)
     uvicorn.run(
         create_app(settings), host=host, port=port, access_log=access_log, server_header=False,
-        timeout_graceful_shutdown=STREAMS_END,
+        timeout_graceful_shutdown=LINGER,
     )  # fmt: skip
 
 

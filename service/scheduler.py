@@ -132,8 +132,12 @@ class Scheduler:
         self.open = False
         while self.running:
             for job in list(self.running.values()):
-                if not job.stopping:
+                if job.stopping:
+                    continue
+                try:
                     await self.stop(job, "released")
+                except OSError:  # a full disk, or no folder yet: a runner that finds no word takes TERM for this one
+                    self.backend.tell(self.settings.runs / job.id, job.attempt, signal.SIGTERM)
             await self.hub.wait(TICK)
 
     async def close(self) -> None:

@@ -39,6 +39,8 @@ class Settings(BaseSettings):
     """seconds for which smaller jobs may overtake the first in the queue while it waits for more cores"""
     grace: Seconds = 60.0
     """seconds for each step of the ladder checkpoint, end, kill when a job is stopped"""
+    release: bool = False
+    """at the end of the service, jobs write a checkpoint and go back into the queue instead of running on"""
     poll: Seconds = 0.5
     """seconds between two looks at what running jobs have written"""
     free_disk: Annotated[int, Field(ge=0)] = 200_000_000

@@ -3,11 +3,18 @@
 numba keeps compiled code beside the source file and looks only at that file's time stamp, so a kernel that calls a
 function of another file would keep the old callee after an edit. frit therefore names its cache folder after the
 content of every solver file that holds compiled code: an edit to any of them opens a fresh folder.
+
+numba needs a folder it can write into, for what it finds compiled for another processor or not at all. An installation
+that only reads its own files (an image) therefore brings compiled code along in `FRIT_CACHE_SEED`, and the first start
+copies it.
 """
 
 import hashlib
 import os
+import shutil
+import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -37,6 +44,20 @@ def cache_folder() -> Path:
     return cache_root() / digest.hexdigest()[:16]
 
 
+def seed(folder: Path) -> None:
+    """Make a cache folder that is not there from the one of its name in `FRIT_CACHE_SEED`, whole or not at all."""
+    source = Path(os.environ.get("FRIT_CACHE_SEED", os.devnull)) / folder.name
+    if folder.exists() or not source.is_dir():
+        return
+    with suppress(OSError):  # another process was quicker; or no room, and then all is compiled or numba complains
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as beside:
+            copy = Path(beside) / "whole"
+            shutil.copytree(source, copy)
+            copy.rename(folder)
+
+
+seed(cache_folder())
 numba.config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
 
 Function = TypeVar("Function", bound=Callable[..., Any])

@@ -1,4 +1,4 @@
-"""A sweep over packings, end to end: asked for in a file, packed, sintered, and found by what was asked and realised."""
+"""A sweep over packings, end to end: asked for, packed, sintered, and found by what was asked and realised."""
 
 import json
 import os

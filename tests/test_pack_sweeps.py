@@ -14,7 +14,7 @@ SWEEP = """
 name = "packs"
 [base]
 domain = { size = [44.0, 38.0] }
-nodes = { spacing = 1.5 }
+nodes = { spacing = 1.25 }
 time = { end = 0.01 }
 [base.particles]
 source = "packing"

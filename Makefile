@@ -34,7 +34,7 @@ pack: setup
 	$(BIN)/frit plot "$(OUT)" --time 1e9 --out "$(OUT)/end.png"
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 slow: setup
 	$(BIN)/python -m pytest -m slow

@@ -37,6 +37,7 @@ from .state import State
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
 LONGEST_WAIT = 25  # steps for which a checkpoint that is due waits for one from which the run goes on without a trace
+SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
@@ -291,6 +292,7 @@ def give_up(error: BaseException, ranks: Ranks, directory: Path) -> int:
         record_end(directory, state, message, retry=not refused)
     finally:
         if ranks.size > 1:
+            time.sleep(SPOKEN)
             ranks.abort(EXIT_STATUS[state])
     return EXIT_STATUS[state]
 

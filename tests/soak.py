@@ -113,9 +113,14 @@ def of_data(data: Path) -> list[psutil.Process]:
 
 
 def runners(data: Path) -> list[int]:
-    """Pids of living runners."""
-    records = [read_json(path) for path in data.glob("runs/*/attempt.json")]
-    return [record["pid"] for record in records if start_of(record["pid"]) == record["pid_start"]]
+    """Pids of living runners; one that has ended and waits for its parent's notice lives no more."""
+    living = []
+    for record in map(read_json, data.glob("runs/*/attempt.json")):
+        with suppress(psutil.Error):
+            same = start_of(record["pid"]) == record["pid_start"]
+            if same and psutil.Process(record["pid"]).status() != psutil.STATUS_ZOMBIE:
+                living.append(int(record["pid"]))
+    return living
 
 
 def kill_one(kind: str, running: Service, random_: random.Random) -> bool:

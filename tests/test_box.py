@@ -193,7 +193,7 @@ def test_meshes_with_slivers_and_gaps(tmp_path: Path, dim: int, spacing: float, 
 # --- ranks
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_any_number_of_ranks_measures_the_same(tmp_path: Path, dim: int) -> None:
     """A particle that the box cuts: to 1e-4 of the truth on 1, 2 and 3 ranks, and to round-off of each other."""
     size, radius = SIZES[dim], RADIUS[dim]

@@ -164,6 +164,7 @@ def test_a_sweep_uploads_the_meshes_along_its_axes(idle: Client, tmp_path: Path)
     assert str(tmp_path) not in json.dumps(made.refresh().data)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_submitted_twice_while_the_service_restarts(tmp_path: Path) -> None:
     """Submissions go on while the service is killed and started again; a stream goes on where it was."""
     server = Process(tmp_path / "data")

@@ -94,7 +94,7 @@ def test_a_base_file_is_read_and_paths_start_where_they_are_written(tmp_path: Pa
 
 def test_without_a_file_the_base_cannot_be_a_path(tmp_path: Path) -> None:
     (tmp_path / "case.json").write_text(json.dumps(base()))
-    with pytest.raises(CaseError, match=r"base = '.*': must be a table"):
+    with pytest.raises(CaseError, match=r"base = '.*: must be a table"):
         parse_sweep({"base": str(tmp_path / "case.json")})
 
 

@@ -1,8 +1,10 @@
 """What the service bears, printed and not asserted: `python tests/benchmarks/bench_service.py [NAME ...]`."""
 
+import asyncio
 import http.client
 import json
 import multiprocessing
+import os
 import random
 import sqlite3
 import sys
@@ -16,9 +18,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import httpx2
 from asking import PACKING, Process
+from soak import of_data
 
-from frit.service.jobs import Job, NewJob
+from frit.service.engine import Engine
+from frit.service.jobs import Job, NewJob, State
+from frit.service.settings import Settings
 from frit.service.store import Store
 from frit.solver.case import parse_case
 from frit.solver.variations import case_text, identity, written
@@ -41,8 +47,6 @@ def new_job(number: int, dice: random.Random) -> NewJob:
 
 def load(port: int, posts: int, connections: int, answers: Any) -> None:
     """In a process of its own: that many POSTs over that many kept connections, one at a time on each."""
-    import asyncio
-
     async def one(count: int, body: bytes) -> list[float]:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         lines = ("Host: 127.0.0.1", "Content-Type: application/json", f"Content-Length: {len(body)}", "", "")
@@ -141,7 +145,65 @@ def asked(connection: http.client.HTTPConnection, path: str) -> tuple[list[float
     return sorted(times), found
 
 
-BENCHES: dict[str, Callable[[], None]] = {"submissions": submissions, "pages": pages}
+# --- jobs that do nothing ---------------------------------------------------------------------------------
+
+STAND_IN = """#!/bin/sh
+[ "$1" = --version ] && exit
+for word; do [ "$before" = --out ] && break; before=$word; done
+%s
+printf '{"state": "done"}' > "$word/run.new" && mv "$word/run.new" "$word/run.json"
+"""
+
+
+def stand_in(folder: Path, work: str) -> None:
+    """In the place of mpirun and the solver: a shell script that records the end of a run."""
+    program = folder / "stand-in"
+    program.write_text(STAND_IN % work)
+    program.chmod(0o755)
+    os.environ["FRIT_MPIRUN"] = str(program)
+
+
+def no_op(count: int = 500, cores: int = 16) -> None:
+    """No-op jobs per second through the local backend: claim, runner, stand-in, exit record, index."""
+
+    async def run(folder: Path) -> float:
+        async with Engine(Settings(data=folder / "data", cores=cores, free_disk=0)) as engine:
+            engine.scheduler.open, dice = False, random.Random(4)
+            made = [engine.store.submit(new_job(number, dice)) for number in range(count)]
+            await asyncio.gather(*map(asyncio.wrap_future, made))
+            start, engine.scheduler.open = time.perf_counter(), True
+            engine.hub.notify()
+            while engine.store.count(State.SUCCEEDED) < count:
+                await asyncio.sleep(0.05)
+            return time.perf_counter() - start
+
+    with tempfile.TemporaryDirectory() as folder:
+        stand_in(Path(folder), "")
+        print(f"no-op jobs: {count / asyncio.run(run(Path(folder))):.0f} per second on {cores} slots")
+
+
+def restart(queued: int = 10_000) -> None:
+    """From the start of the process to /readyz, with that many jobs queued."""
+    with tempfile.TemporaryDirectory() as folder:
+        stand_in(Path(folder), "sleep 600")
+        store, dice = Store(Path(folder)), random.Random(3)
+        wait([store.submit(new_job(number, dice)) for number in range(queued)])
+        store.close()
+        for _ in range(3):
+            server = Process(Path(folder), free_disk=0)
+            start = time.perf_counter()
+            server.start()
+            while httpx2.get(f"{server.url}/readyz").status_code != 200:
+                time.sleep(0.01)
+            print(f"ready {time.perf_counter() - start:.2f} s after the start, {queued} jobs queued")
+            server.end()
+        for process in of_data(Path(folder)):  # what the stand-ins left running
+            process.kill()
+
+
+BENCHES: dict[str, Callable[[], None]] = {
+    "submissions": submissions, "pages": pages, "no-op": no_op, "restart": restart,
+}  # fmt: skip
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or BENCHES:

@@ -44,6 +44,14 @@ def read_json(path: Path) -> dict[str, Any]:
     return tree if isinstance(tree, dict) else {}
 
 
+def stamp(path: Path) -> tuple[int, int] | None:
+    """Differs once the file is replaced or written anew; None: there is none."""
+    with suppress(FileNotFoundError):
+        status = path.stat()
+        return status.st_ino, status.st_mtime_ns
+    return None
+
+
 def try_lock(path: Path) -> int | None:
     """A descriptor that holds the lock as long as it, or a copy of it in any process, is open; None: it is held."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

@@ -17,6 +17,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
+from .files import read_json, stamp
+
 ENDS = ("done", "failed", "interrupted", "refused")
 # An outer MPI or Slurm step, which the ranks would join (PMI covers PMIX), and what makes Python write
 # a printed line in two parts, between which another rank's may get.
@@ -84,11 +86,7 @@ def clean_environment(environ: Mapping[str, str]) -> dict[str, str]:
 
 def read_record(directory: Path) -> dict[str, Any]:
     """run.json; empty when it is not there or torn."""
-    try:
-        record = json.loads((directory / "run.json").read_text())
-    except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
-        return {}
-    return record if isinstance(record, dict) else {}
+    return read_json(directory / "run.json")
 
 
 class Launch:
@@ -115,7 +113,7 @@ class Launch:
         self.directory, self.stopping = directory, False
         self._spoken: deque[str] = deque(maxlen=40)
         directory.mkdir(parents=True, exist_ok=True)
-        self._record_before = _stamp(directory / "run.json")
+        self._record_before = stamp(directory / "run.json")
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -180,7 +178,7 @@ class Launch:
             pass
         self._reaper.join()
         record, code, spoken = read_record(self.directory), self._process.returncode, "\n".join(self._spoken)
-        fresh = _stamp(self.directory / "run.json") != self._record_before
+        fresh = stamp(self.directory / "run.json") != self._record_before
         if fresh and record.get("state") in ENDS:
             return Outcome(record["state"], record.get("message"), code, spoken, record.get("retry", False))
         if self.stopping and (self.directory / "checkpoint.h5").exists():
@@ -213,8 +211,3 @@ def kill_marked(mark: str) -> bool:
                     os.kill(int(name), signal.SIGKILL)
                     found = True
     return found
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """Differs once the file is replaced or written anew."""
-    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None

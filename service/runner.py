@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .files import boot, read_json, start_of, try_lock, write_json
+from .files import boot, read_json, stamp, start_of, try_lock, write_json
 from .jobs import Exit, Move
 from .launch import Launch, LaunchError, Outcome, kill_marked, read_record
 
@@ -239,14 +239,6 @@ def read_exit(directory: Path, attempt: int) -> Exit | None:
         return Exit(**{**record, "move": Move(record["move"])})
     except (LookupError, TypeError, ValueError):  # damaged: as good as none
         return None
-
-
-def stamp(path: Path) -> tuple[int, int] | None:
-    """Differs once a file is replaced."""
-    with suppress(FileNotFoundError):
-        status = path.stat()
-        return status.st_ino, status.st_mtime_ns
-    return None
 
 
 def timer(seconds: float, call: Callable[[], None]) -> None:

@@ -55,11 +55,6 @@ class Settings(BaseSettings):
     """jobs waiting in the queue, at most"""
 
     @property
-    def database(self) -> str:
-        """URL of the index."""
-        return f"sqlite:///{self.data.absolute() / 'frit.db'}"
-
-    @property
     def runs(self) -> Path:
         """Parent of the run directories."""
         return self.data.absolute() / "runs"

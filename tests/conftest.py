@@ -1,9 +1,11 @@
 """What every test shares: floating point that complains, and the communicator of a single rank."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+from serving import stand_in
 
 from frit.solver.partition import Ranks
 
@@ -19,3 +21,9 @@ def _floating_point_errors_raise() -> Iterator[None]:
 def ranks() -> Ranks:
     """One rank, without MPI."""
     return Ranks()
+
+
+@pytest.fixture
+def standing_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs do what their names say, and no more."""
+    monkeypatch.setenv("FRIT_MPIRUN", stand_in(tmp_path))

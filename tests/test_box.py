@@ -12,6 +12,7 @@ import pytest
 from launching import Case, columns, solve
 from reference import mean_in_box
 from scipy.spatial import Delaunay
+from test_observe import boxes as ordinary_boxes
 
 from frit.solver.arrays import Floats
 from frit.solver.box import box_weights
@@ -63,13 +64,8 @@ def shaken(directory: Path, size: tuple[float, ...], spacing: float, amount: flo
 
 def boxes(size: tuple[float, ...]) -> Iterator[tuple[Floats, Floats]]:
     """The domain, on nodes, through cells, thinner than a cell, within one cell, along walls, in a corner."""
-    full, ones = np.array(size), np.ones(len(size))
-    yield 0.0 * full, full
-    yield ones, full - 1.0
-    yield 0.3137 * full, 0.7713 * full
-    yield 0.41 * full, 0.41 * full + 0.05 * ones
-    yield 0.0 * full, np.where(np.arange(len(size)) == 0, 0.123, full)
-    yield np.where(np.arange(len(size)) == 1, 2.2, 0.5), np.where(np.arange(len(size)) == 1, 2.9, full - 0.25)
+    full = np.array(size)
+    yield from ordinary_boxes(size)
     yield full - 0.3, full
 
 

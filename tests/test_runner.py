@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import psutil
 import pytest
-from serving import ended, in_state, new_job, settings, stand_in, submit, until
+from serving import ended, in_state, new_job, settings, submit, until
 from soak import of_data
 
 from frit.service.backends.local import BackendError, LocalBackend
@@ -22,11 +22,6 @@ from frit.service.jobs import Job, Move, State
 from frit.service.launch import Outcome
 from frit.service.runner import Order, judge, read_exit
 from frit.service.store import Store
-
-
-@pytest.fixture
-def standing_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FRIT_MPIRUN", stand_in(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import sqlalchemy as sa
 from hypothesis import given
 from hypothesis import strategies as st
-from serving import ended, in_state, new_job, settings, stand_in, submit, until
+from serving import ended, in_state, new_job, settings, submit, until
 
 from frit.service.engine import Engine, EngineError
 from frit.service.jobs import State
@@ -16,12 +16,6 @@ from frit.service.scheduler import Scheduler, choose
 from frit.service.settings import own_cores
 
 queues = st.lists(st.integers(1, 9), max_size=20).map(lambda ranks: list(enumerate(ranks)))
-
-
-@pytest.fixture
-def standing_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Jobs do what their names say, and no more."""
-    monkeypatch.setenv("FRIT_MPIRUN", stand_in(tmp_path))
 
 
 # --- the choice -------------------------------------------------------------------------------------------

@@ -36,7 +36,6 @@ from .state import State
 
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
-LONGEST_WAIT = 25  # steps for which a checkpoint that is due waits for one from which the run goes on without a trace
 SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
@@ -158,7 +157,6 @@ class Recorder:
         self.rows = output.History(directory, state.time if state.step else None) if self.ranks.root else None
         self.snapshots = output.Snapshots(directory, case, mesh, self.collector, fresh)
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
-        self.waited = 0
         self.latest: dict[str, Any] = {}  # history row
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
 
@@ -174,18 +172,11 @@ class Recorder:
         self.snapshots.write(number, time_, state, u)
 
     def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
-        """Checkpoint when it is time or somebody asks; True when somebody asks for the end.
-
-        Both wait for a step after which a resumed run takes the very steps that this one takes, but not for long: then
-        the resumed run may differ, by as much as the integrator's tolerance allows.
-        """
+        """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
         due = time.monotonic() - self.checkpoint_clock >= scheme.d.case.output.checkpoint_every
         wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
         due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
         self._show(scheme, state)
-        self.waited = 0 if integrator.traceless or not (due or asked or stop) else self.waited + 1
-        if 0 < self.waited <= LONGEST_WAIT:
-            return False
         if (due or asked) and not stop:
             self.checkpoint(scheme, state, integrator)
         return bool(stop)

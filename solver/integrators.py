@@ -35,10 +35,6 @@ class Integrator(Protocol):
     def memory(self) -> dict[str, float]:
         """Numbers to keep in a checkpoint."""
 
-    @property
-    def traceless(self) -> bool:
-        """Whether the next step rests on nothing but the state and `memory`: not on an earlier rate or stiffness."""
-
 
 def paper_step(shortest: float, case: Case) -> float:
     """dt = 0.1 d_min^2 / (2 L kappa_eta), d_min the smallest distance between nodes: the paper's rule (2.3)."""
@@ -91,18 +87,13 @@ class RK2:
         """Nothing: the step is fixed."""
         return {}
 
-    @property
-    def traceless(self) -> bool:
-        """Always."""
-        return True
-
 
 SAFETY = 0.8
 GROWTH = 5.0  # largest factor between two steps
 SHRINK = 0.1
 MOST_STAGES = 200
 ESTIMATE_EVERY = 25  # accepted steps between two estimates of the spectral radius
-RELAX_EVERY = 5  # accepted steps for which the contacts' stiffness is kept
+THETA = 0.5  # contacts may relax within this part of a step
 MARGIN = 1.2  # factor on an estimate of the spectral radius
 
 
@@ -112,14 +103,20 @@ class Chebyshev:
     s stages are stable for dt |lambda| < 0.65 (s^2 - 1) on the negative real axis: the cost of a step grows with the
     square root of its length. The error of a step is estimated from its end points; steps aim at `tolerance` in the
     volume-weighted root mean square of e / (1 + |u|) over the nodes that change.
+
+    Contacts are far stiffer than diffusion, and a contact that forms pulls its particles together in an instant. Their
+    stiffness is measured at the end of each step, and during the next they relax within `THETA` of the step, linearly
+    implicit in the few unknowns of the rigid motion: what would take hundreds of stages takes none.
     """
 
     stops_at_events = False
 
     def __init__(self, tolerance: float, tau: float, memory: dict[str, float] | None = None) -> None:
-        """tau: time in which contacts may relax at the fastest, see `Scheme.relax_contacts`."""
-        self.tolerance, self.tau = tolerance, tau
+        """tau: shortest time in which contacts may relax, see `Scheme.rates`."""
+        self.tolerance, self.least_tau = tolerance, tau
         kept = memory or {}
+        self.repeats = kept.get("fresh", 0.0) > 0.0  # the first rate was known, and counted, before the checkpoint
+        self.tau = kept.get("tau", tau)
         self.dt = kept.get("dt", 0.0)
         self.radius = kept.get("radius", 0.0)
         self.age = kept.get("age", 0.0)
@@ -134,14 +131,9 @@ class Chebyshev:
     def memory(self) -> dict[str, float]:
         """The step that comes next, and the spectral radius."""
         return {
-            "dt": self.dt, "radius": self.radius, "age": self.age,
-            "error_before": self.error_before, "dt_before": self.dt_before,
+            "tau": self.tau, "dt": self.dt, "radius": self.radius, "age": self.age,
+            "error_before": self.error_before, "dt_before": self.dt_before, "fresh": float(self.fresh),
         }  # fmt: skip
-
-    @property
-    def traceless(self) -> bool:
-        """Before a step that measures the rate and the contacts' stiffness anew."""
-        return not self.fresh or self.age % RELAX_EVERY == 0
 
     def restart(self, scheme: Scheme, state: State) -> None:
         """Fit the work arrays to the state and forget the last rate."""
@@ -156,25 +148,27 @@ class Chebyshev:
         """Try steps until one is accepted."""
         nodes = scheme.active.nodes
         kernels.start(self.old, state.u, nodes)
-        if not self.fresh or self.age % RELAX_EVERY == 0:
-            scheme.relax_contacts(state.u, self.tau)
-            self.fresh = False
         if self.fresh:
             self.rate_0, self.rate_1 = self.rate_1, self.rate_0
         else:
-            scheme.rates(state.u, self.rate_0)
-            state.evaluations += 1
+            scheme.rates(state.u, self.rate_0, self.tau)
+            state.evaluations += 0 if self.repeats else 1
+        self.repeats = False
         if self.radius == 0.0 or self.age >= ESTIMATE_EVERY:
             self._estimate(scheme, state)
         if self.dt == 0.0:
             self.dt = 0.1 / self.radius
+        relax, rejected = scheme.relax, False
         while True:
             dt = self._fit(limit - state.time)
             error = self._try(scheme, state, dt)
             if error <= 1.0:
                 break
+            scheme.relax = relax
             self.dt = dt * max(SHRINK, SAFETY * error ** (-1.0 / 3.0)) if np.isfinite(error) else 0.1 * dt
-            self._estimate(scheme, state)
+            if rejected:  # twice in a row: perhaps the step was not stable
+                self._estimate(scheme, state)
+            rejected = True
             if not self.dt > 1e-12 * max(limit, 1.0):
                 raise FloatingPointError(f"step size fell to {self.dt:.1e} at t = {state.time:.6g}")
         self._accept(state, dt, error, limit)
@@ -210,7 +204,8 @@ class Chebyshev:
             kernels.chebyshev_stage(new, self.old, before, last, rate, self.rate_0, c, nodes)
             before, last, new = last, new, before
         kernels.start(state.u, last, nodes)
-        scheme.rates(state.u, self.rate_1)
+        self.tau = max(self.least_tau, THETA * dt)
+        scheme.rates(state.u, self.rate_1, self.tau)
         state.evaluations += stages
         sums = np.array([0.0, float(scheme.d.mass[scheme.active.owned].sum())])
         sums[0] = kernels.chebyshev_error(
@@ -233,7 +228,10 @@ class Chebyshev:
         self.fresh = True
 
     def _estimate(self, scheme: Scheme, state: State) -> None:
-        """Spectral radius of the Jacobian by the nonlinear power method, started from the rate itself."""
+        """Spectral radius of the Jacobian by the nonlinear power method.
+
+        It starts from the rate with signs that change from node to node: the stiffest modes are among the shortest.
+        """
         nodes, ranks = scheme.active.nodes, scheme.d.share.ranks
         moved, direction, _, rate = self.work
         size = sqrt(_total(ranks, kernels.squares(self.old, scheme.active.owned)))
@@ -243,6 +241,7 @@ class Chebyshev:
             return
         delta = 1e-7 * max(size, 1.0)
         kernels.start(direction, self.rate_0, nodes)
+        direction[scheme.d.share.nodes * 2654435761 % 2**32 >= 2**31] *= -1.0
         radius = 0.0
         for _ in range(50):
             kernels.advance(moved, self.old, delta / length, direction, nodes)

@@ -110,59 +110,18 @@ def gradient(
 
 
 @jit
-def add_contact(
-    force: Floats, point: Floats, row: int, l: int, owner: Numbers, w: float, x: Floats, m: Coefficients
-) -> None:
-    """Add b_a w_p and (x_p cross b_a) w_p of every touching pair to the particles' forces and torques   (25)-(27)
-
-    b_a = k sum_{b != a} (rho - rho_0) [eta_a eta_b > c] (grad eta_a - grad eta_b). force (particles, dim + rotations);
-    x is measured from the origin that `rigid.velocities` moves to the particle's centre.
-    """
-    dim = x.shape[0]
-    slots = owner.shape[1]
-    for s in range(slots):
-        a = owner[l, s]
-        if a < 0 or point[row, 1 + s] <= 0.0:
-            continue
-        for t in range(s + 1, slots):
-            b = owner[l, t]
-            if b < 0 or point[row, 1 + s] * point[row, 1 + t] <= m.c:
-                continue
-            pull = w * m.k * (point[row, 0] - m.rho_0)
-            fx = pull * (point[row + 1, 1 + s] - point[row + 1, 1 + t])
-            fy = pull * (point[row + 2, 1 + s] - point[row + 2, 1 + t])
-            force[a, 0] += fx
-            force[a, 1] += fy
-            force[b, 0] -= fx
-            force[b, 1] -= fy
-            torque = x[0] * fy - x[1] * fx
-            if dim == 2:
-                force[a, 2] += torque
-                force[b, 2] -= torque
-            else:
-                fz = pull * (point[row + 3, 1 + s] - point[row + 3, 1 + t])
-                force[a, 2] += fz
-                force[b, 2] -= fz
-                force[a, 3] += x[1] * fz - x[2] * fy
-                force[b, 3] -= x[1] * fz - x[2] * fy
-                force[a, 4] += x[2] * fx - x[0] * fz
-                force[b, 4] -= x[2] * fx - x[0] * fz
-                force[a, 5] += torque
-                force[b, 5] -= torque
-
-
-@jit
 def potential(
-    W: Floats, force: Floats, point: Floats, D: Floats, squares: Floats, u: Floats,
-    live: Integers, owner: Numbers, mask: Floats, present: Flags, several: Flags, weights: Floats, x: Floats,
-    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients, rigid: bool,
-) -> None:
-    """First half of an evaluation: fields at the live points, D, their shares of W, and the contact forces.
+    W: Floats, touching: Integers, point: Floats, D: Floats, squares: Floats, u: Floats,
+    live: Integers, mask: Floats, present: Flags, several: Flags, weights: Floats,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients,
+) -> int:
+    """First half of an evaluation: fields at the live points, D, and their shares of W; how many points touch.
 
-    W (n,) gets partial sums, force (particles, dim + rotations) is added to where `rigid`; point, D and squares = S2
-    are filled.
+    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching (L,) from its start with the l of the
+    points where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2.
     """
-    width = 1 + x.shape[1]
+    width = table.shape[0]
+    touches = 0
     for l in range(live.size):
         p = live[l]
         row = l * width
@@ -194,16 +153,77 @@ def potential(
                 P2 += total(inside * inside)
             S2 += total(square)
             S3 += total(square * eta)
+        overlap = S1 * S1 - P2
         squares[l] = S2
-        D[l] = mobility(rho, S1 * S1 - P2, m)
+        D[l] = mobility(rho, overlap, m)
         add_potential(W, weights[p], row, point, rho, S2, S3, begin, count, start, nodes, table, work, m)
-        if rigid and several[l]:
-            add_contact(force, point, row, l, owner, weights[p], x[p], m)
+        if overlap > m.c:
+            touching[touches] = l
+            touches += 1
+    return touches
+
+
+@jit
+def touching_share(point: Floats, row: int, i: int, j: int, w: float, dim: int, c: float) -> float:
+    """The share of a point's cell in which eta_a eta_b > c; a, b in columns i, j.
+
+    The cell counts as a ball of its volume w, and the product as linear in it: with d the distance of the level c from
+    the point in radii, 1/2 + d (3 - d^2) / 4 of the ball are above it. As an interface sweeps over the points the
+    contact force then follows it without jumps; as the cells shrink, it becomes the bracket of (6).
+    """
+    product = point[row, i] * point[row, j]
+    square = 0.0
+    for k in range(1, 1 + dim):
+        slope = point[row, i] * point[row + k, j] + point[row, j] * point[row + k, i]
+        square += slope * slope
+    radius = np.sqrt(w / np.pi) if dim == 2 else np.cbrt(0.75 * w / np.pi)
+    reach = min(radius * np.sqrt(square), 0.5 * c)
+    if abs(product - c) >= reach:
+        return 1.0 if product > c else 0.0
+    d = (product - c) / reach
+    return float(0.5 + 0.25 * d * (3.0 - d * d))
+
+
+@jit
+def contact_forces(
+    force: Floats, touching: Integers, point: Floats, live: Integers, owner: Numbers,
+    weights: Floats, x: Floats, m: Coefficients,
+) -> None:
+    """Add b_a w_p and (x_p cross b_a) w_p of every touching pair to the particles' forces and torques   (25)-(27)
+
+    b_a = k sum_{b != a} (rho - rho_0) [eta_a eta_b > c] (grad eta_a - grad eta_b), the bracket as `touching_share`.
+    force (particles, dim + rotations); x is measured from the origin that `rigid.velocities` moves to the particle's
+    centre. Expects the fields that `potential` left in `point`.
+    """
+    dim = x.shape[1]
+    slots = owner.shape[1]
+    push = np.zeros(6)
+    for l in touching:
+        p = live[l]
+        row = l * (1 + dim)
+        for s in range(slots):
+            a = owner[l, s]
+            if a < 0 or point[row, 1 + s] <= 0.0:
+                continue
+            for t in range(s + 1, slots):
+                b = owner[l, t]
+                if b < 0 or point[row, 1 + t] <= 0.0:
+                    continue
+                share = touching_share(point, row, 1 + s, 1 + t, weights[p], dim, m.c)
+                if share == 0.0:
+                    continue
+                pull = share * weights[p] * m.k * (point[row, 0] - m.rho_0)
+                for k in range(dim):
+                    push[k] = pull * (point[row + 1 + k, 1 + s] - point[row + 1 + k, 1 + t])
+                turn(push, x[p])
+                for k in range(force.shape[1]):
+                    force[a, k] += push[k]
+                    force[b, k] -= push[k]
 
 
 @jit
 def contact_stiffness(
-    stiffness: Floats, keys: Integers, point: Floats, live: Integers, owner: Numbers, several: Flags,
+    stiffness: Floats, keys: Integers, touching: Integers, point: Floats, live: Integers, owner: Numbers,
     weights: Floats, x: Floats, particles: int, m: Coefficients, huang: bool,
 ) -> None:
     """How the contact forces answer to rigid motion: stiffness[pair] += w_p k e_p (d_a, d_b) over touching points.
@@ -218,16 +238,17 @@ def contact_stiffness(
     size = stiffness.shape[2]
     direction = np.zeros(6)
     answer = np.zeros((2, 6))
-    for l in range(live.size):
-        if not several[l]:
-            continue
+    for l in touching:
         row = l * (1 + dim)
         p = live[l]
         for s in range(owner.shape[1]):
             for t in range(owner.shape[1]):
                 a = owner[l, s]
                 b = owner[l, t]
-                if a < 0 or b <= a or point[row, 1 + s] * point[row, 1 + t] <= m.c or point[row, 1 + s] <= 0.0:
+                if a < 0 or b <= a or point[row, 1 + s] <= 0.0 or point[row, 1 + t] <= 0.0:
+                    continue
+                share = touching_share(point, row, 1 + s, 1 + t, weights[p], dim, m.c)
+                if share == 0.0:
                     continue
                 for k in range(dim):
                     direction[k] = point[row + 1 + k, 1 + s] - point[row + 1 + k, 1 + t]
@@ -240,7 +261,7 @@ def contact_stiffness(
                 for c in range(2):
                     for i in range(size):
                         for j in range(size):
-                            stiffness[pair, c, i, j] += weights[p] * m.k * direction[i] * answer[c, j]
+                            stiffness[pair, c, i, j] += share * weights[p] * m.k * direction[i] * answer[c, j]
 
 
 @jit

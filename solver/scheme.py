@@ -32,6 +32,7 @@ class Scheme:
         self.slot_of, self.node_owner = state.slot_of, state.owner
         self.W = np.zeros(self.d.nodes)
         self.D, self.S2 = np.empty((2, points))
+        self.touching, self.touches = np.empty(points, dtype=np.int64), 0
         self.point = np.zeros((points * (1 + self.d.dim), state.u.shape[1]))
         bodies = self.d.dim + rigid.rotations(self.d.dim), 1 + self.d.dim
         self.sums = np.zeros((self.particles, sum(bodies)))
@@ -40,20 +41,27 @@ class Scheme:
         self.work = np.empty((1, self.d.shape.longest))
         self.velocity = np.zeros((self.d.dim, state.u.shape[1]))
 
-    def rates(self, u: Floats, rate: Floats) -> None:
-        """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective."""
+    def rates(self, u: Floats, rate: Floats, tau: float | None = None) -> None:
+        """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective.
+
+        tau: measure the contacts' stiffness here, and from now on let them relax no faster than 1 / tau;
+        see `rigid.relaxation`.
+        """
         d, a, m, table = self.d, self.active, self.d.coefficients, self.d.shape
         moving = d.case.model.rigid_motion
 
-        # Fields and gradients at the points (17), mobility (5), contact forces (25)-(27), and the potential (24)
+        # Fields and gradients at the points (17), mobility (5), and the potential (24)
         #   W_a = 1/m_a sum_p w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]
         self._gather(u)
         d.share.halo.add(self.W)
         self.W[a.nodes] /= d.mass[a.nodes]
 
-        # Rigid motion of each particle (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
+        # Contact forces (25)-(27) and rigid motion of each particle (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
         if moving:
-            self.motion = self.relax(rigid.velocities(*self._bodies(u), m))
+            forces, moments = self._bodies(u)
+            if tau is not None and len(a.pairs):
+                self.relax = rigid.relaxation(self._stiffness(), a.pairs, moments, m, tau)
+            self.motion = self.relax(rigid.velocities(forces, moments, m))
 
         # Fluxes (20), (21)
         #   rate rho_a = 1/m_a sum_p w_p [ -D grad N_a . grad W_p + rho_p grad N_a . v_adv ]
@@ -69,35 +77,34 @@ class Scheme:
         d.share.halo.add(rate)
         kernels.divide(rate, d.mass, a.nodes)
 
-    def relax_contacts(self, u: Floats, tau: float) -> None:
-        """From now on, contacts relax no faster than 1 / tau; see `rigid.relaxation`. Collective."""
+    def _stiffness(self) -> Floats:
+        """How the contact forces answer to rigid motion, (pairs, 2, k, k) summed over the ranks, after `_gather`."""
         d, a = self.d, self.active
-        if not (d.case.model.rigid_motion and len(a.pairs)):
-            return
-        self._gather(u)
-        stiffness = np.zeros((len(a.pairs), 2, *2 * self.motion.shape[1:]))
+        size = self.motion.shape[1]
+        stiffness = np.zeros((len(a.pairs), 2, size, size))
         keys = a.pairs[:, 0] * self.particles + a.pairs[:, 1]
         kernels.contact_stiffness(
-            stiffness, keys, self.point, a.live, a.owner, a.several, d.weights, d.x,
+            stiffness, keys, self.touching[: self.touches], self.point, a.live, a.owner, d.weights, d.x,
             self.particles, d.coefficients, d.huang,
         )
-        _, moments = self._bodies(u)
-        self.relax = rigid.relaxation(d.share.ranks.sum(stiffness), a.pairs, moments, d.coefficients, tau)
+        return d.share.ranks.sum(stiffness)
 
     def _gather(self, u: Floats) -> None:
-        """Fields, D and contact forces of this rank's points, and its part of W, in the work arrays."""
+        """Fields and D of this rank's points, and its part of W, in the work arrays."""
         d, a, table = self.d, self.active, self.d.shape
         kernels.start(self.W, a.potential, a.nodes)
-        self.sums[:] = 0.0
-        kernels.potential(
-            self.W, self.forces, self.point, self.D, self.S2, u, a.live, a.owner, a.mask, a.present, a.several,
-            d.weights, d.x, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
-            d.case.model.rigid_motion,
+        self.touches = kernels.potential(
+            self.W, self.touching, self.point, self.D, self.S2, u, a.live, a.mask, a.present, a.several,
+            d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
         )
 
     def _bodies(self, u: Floats) -> tuple[Floats, Floats]:
-        """Forces and moments of all particles, summed over the ranks, after `_gather`."""
+        """Contact forces and moments of all particles, summed over the ranks, after `_gather`."""
         d, a = self.d, self.active
+        self.sums[:] = 0.0
+        kernels.contact_forces(
+            self.forces, self.touching[: self.touches], self.point, a.live, a.owner, d.weights, d.x, d.coefficients
+        )
         self.moments += a.moments
         kernels.add_moments(self.moments, u, a.owned, self.node_owner, d.mass, d.first_moment)
         d.share.ranks.sum(self.sums)

@@ -137,13 +137,24 @@ class Bodies:
         return np.asarray((m.m_t * self.F[a] + m.m_r * turn) / self.V[a])[:, : x.shape[1]]
 
 
+def touching_share(one: Floats, other: Floats, slope: Floats, other_slope: Floats, w: Floats, c: float) -> Floats:
+    """The volume of the part of each cell, a ball of volume w, in which eta_a eta_b > c, over w; in the plane the same
+    cubic with the radius of a disc. No cell counts as larger than what takes the product from c to c / 2."""
+    excess = one * other - c
+    steepness = np.linalg.norm(one[:, None] * other_slope + other[:, None] * slope, axis=1)
+    radius = np.sqrt(w / np.pi) if slope.shape[1] == 2 else (w / (4 / 3 * np.pi)) ** (1 / 3)
+    reach = np.minimum(radius * steepness, c / 2)
+    d = np.clip(excess / np.where(reach > 0, reach, 1e-300), -1, 1)
+    return np.asarray((d + 1) ** 2 * (2 - d) / 4)
+
+
 def bodies(rho_p: Floats, eta_p: Floats, slopes: Floats, w: Floats, x: Floats, m: Coefficients) -> Bodies:
     """(6)-(9) from the values at the points: rho_p (p,), eta_p (p, k), slopes (p, k, dim) = grad eta."""
     V = w @ eta_p
     r = (w[:, None] * eta_p).T @ in_space(x) / V[:, None]
     F, T = np.zeros_like(r), np.zeros_like(r)
     for a, b in permutations(range(len(V)), 2):
-        touching = eta_p[:, a] * eta_p[:, b] > m.c
+        touching = touching_share(eta_p[:, a], eta_p[:, b], slopes[:, a], slopes[:, b], w, m.c)
         density = (m.k * (rho_p - m.rho_0) * touching)[:, None] * in_space(slopes[:, a] - slopes[:, b])
         F[a] += w @ density
         T[a] += w @ np.cross(in_space(x) - r[a], density)

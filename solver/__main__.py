@@ -97,6 +97,8 @@ def execute(
         state.u[:], _ = slots.repack(
             kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1]
         )
+        if kept.motion is not None:
+            scheme.motion = kept.motion
     integrator = make_integrator(case, mesh, kept.memory if kept else None)
     if ranks.root:
         record_start(directory, asked, ranks.size, fresh, packing)

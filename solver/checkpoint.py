@@ -10,13 +10,15 @@ from typing import Any
 import h5py
 import numpy as np
 
+from .arrays import Floats
 from .geometry import Mesh
 from .partition import Collector
 from .scheme import Scheme
 from .state import State
 
 NAME = "checkpoint.h5"
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)  # 1 lacks the rigid motion
 
 
 class CheckpointError(RuntimeError):
@@ -33,6 +35,7 @@ class Checkpoint:
     state: State
     reference: State
     memory: dict[str, float]
+    motion: Floats | None  # (particles, dim + rotations) `Scheme.carried`; None: not known
     wall_time: float
 
 
@@ -50,7 +53,7 @@ def write(
     }
     if not scheme.d.share.ranks.root:
         return
-    fields["slot_of"] = state.slot_of
+    fields |= {"slot_of": state.slot_of, "motion": scheme.carried}
     beside = directory / (NAME + ".new")
     with h5py.File(beside, "w") as file:
         for name, values in fields.items():
@@ -66,12 +69,12 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
     path = directory / NAME
     try:
         with h5py.File(path) as file:
-            values = {name: file[name][...] for name in ("u", "owner", "reference", "slot_of")}
+            values = {name: dataset[...] for name, dataset in file.items()}
             attributes = dict(file.attrs)
     except (OSError, KeyError) as error:
         raise CheckpointError(f"{path}: cannot be read as a checkpoint: {error}") from error
-    if attributes["format"] != FORMAT:
-        raise CheckpointError(f"{path}: format {attributes['format']}, this frit reads format {FORMAT}")
+    if attributes["format"] not in READABLE:
+        raise CheckpointError(f"{path}: format {attributes['format']}, this frit reads formats {READABLE}")
     notes = json.loads(attributes["notes"])
     if notes["identity"] != identity:
         raise CheckpointError(f"{path}: belongs to another case than case.json")
@@ -81,7 +84,7 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
     counts = float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])
     state = State(*counts, values["u"], values["owner"], values["slot_of"])
     reference = State(*counts, values["reference"], values["owner"], values["slot_of"])
-    return Checkpoint(state, reference, notes["memory"], notes["wall_time"])
+    return Checkpoint(state, reference, notes["memory"], values.get("motion"), notes["wall_time"])
 
 
 def mesh_hash(mesh: Mesh) -> str:

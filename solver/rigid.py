@@ -1,11 +1,12 @@
 """Rigid-body motion: from contact forces and particle moments to velocities   (6)-(11).
 
 Contacts are by far the stiffest part of the model, and the least interesting: within a few hundredths of a time unit
-the particles sit where their forces vanish, and then follow diffusion. `relaxation` keeps that motion and bounds its
-speed.
+the particles sit where their forces vanish, and then follow diffusion. `Relaxation` keeps that motion and bounds the
+speed at which they get there.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array, eye_array
@@ -51,16 +52,29 @@ def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
     return np.hstack([m.m_t * F / volume - cross(omega, centre), omega])
 
 
-def relaxation(
-    stiffness: Floats, pairs: Integers, moments: Floats, m: Coefficients, tau: float
-) -> Callable[[Floats], Floats]:
-    """The map from V = M Q to the V_tau of (I + tau M S) V_tau = M Q.
+@dataclass(frozen=True)
+class Relaxation:
+    """Contacts that relax no faster than 1 / tau: the map from the free motion V = M Q to the V_tau of
+
+    (I + tau M S) (V_tau - V_0) = M Q - V_0
 
     M takes forces Q = (F, T) to motions V = (v, omega), `velocities`; S says how forces answer to motion, dQ/dt = -S V.
-    A mode that relaxes at the rate lambda now does at lambda / (1 + tau lambda) < 1 / tau: an implicit Euler step
-    of length tau for the forces. Slow motion keeps its speed, but for a lag of tau.
-    stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over the ranks.
+    A mode that relaxes at the rate lambda now does at lambda / (1 + tau lambda) < 1 / tau, an implicit Euler step of
+    length tau for the forces; V_0, the motion of late, goes on freely, so that steady motion does not lag behind.
     """
+
+    carried: Floats  # V_0 (particles, dim + rotations)
+    solve: Callable[[Floats], Floats]
+
+    def __call__(self, free: Floats) -> Floats:
+        """V_tau for the free motion V."""
+        return self.carried + self.solve((free - self.carried).ravel()).reshape(free.shape)
+
+
+def relaxation(
+    stiffness: Floats, pairs: Integers, moments: Floats, m: Coefficients, tau: float, carried: Floats
+) -> Relaxation:
+    """The relaxation of this stiffness (pairs, 2, k, k), as `kernels.contact_stiffness` leaves it, summed over ranks."""
     particles, size = len(moments), stiffness.shape[2]
     units = np.broadcast_to(np.eye(size)[:, None, :], (size, particles, size))
     M = np.stack([velocities(unit, moments, m) for unit in units], axis=2)
@@ -72,5 +86,4 @@ def relaxation(
     columns = (block_columns[:, None, None] * size + np.arange(size)[None, None, :]) + np.zeros((1, size, 1), dtype=int)
     count = particles * size
     system = eye_array(count) + coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(count, count))
-    factors = splu(system.tocsc())
-    return lambda motion: factors.solve(motion.ravel()).reshape(motion.shape)
+    return Relaxation(carried, splu(system.tocsc()).solve)

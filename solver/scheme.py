@@ -22,6 +22,7 @@ class Scheme:
         self.d = d
         self.particles = len(state.slot_of)
         self.relax: Callable[[Floats], Floats] = lambda motion: motion
+        self.motion = np.zeros((self.particles, d.dim + rigid.rotations(d.dim)))
         self.activate(state)
 
     def activate(self, state: State) -> None:
@@ -34,18 +35,18 @@ class Scheme:
         self.D, self.S2 = np.empty((2, points))
         self.touching, self.touches = np.empty(points, dtype=np.int64), 0
         self.point = np.zeros((points * (1 + self.d.dim), state.u.shape[1]))
-        bodies = self.d.dim + rigid.rotations(self.d.dim), 1 + self.d.dim
-        self.sums = np.zeros((self.particles, sum(bodies)))
-        self.forces, self.moments = self.sums[:, : bodies[0]], self.sums[:, bodies[0] :]
-        self.motion = np.zeros((self.particles, bodies[0]))
+        size = self.motion.shape[1]
+        self.sums = np.zeros((self.particles, size + 1 + self.d.dim))
+        self.forces, self.moments = self.sums[:, :size], self.sums[:, size:]
+        self.carried = self.motion  # what contacts measured next carry on from: a resumed run needs it
         self.work = np.empty((1, self.d.shape.longest))
         self.velocity = np.zeros((self.d.dim, state.u.shape[1]))
 
     def rates(self, u: Floats, rate: Floats, tau: float | None = None) -> None:
         """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective.
 
-        tau: measure the contacts' stiffness here, and from now on let them relax no faster than 1 / tau;
-        see `rigid.relaxation`.
+        tau: measure the contacts' stiffness here, and from now on let them relax no faster than 1 / tau around the
+        motion of the evaluation before; see `rigid.Relaxation`.
         """
         d, a, m, table = self.d, self.active, self.d.coefficients, self.d.shape
         moving = d.case.model.rigid_motion
@@ -56,12 +57,14 @@ class Scheme:
         d.share.halo.add(self.W)
         self.W[a.nodes] /= d.mass[a.nodes]
 
-        # Contact forces (25)-(27) and rigid motion of each particle (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
+        # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
         if moving:
             forces, moments = self._bodies(u)
+            free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
-                self.relax = rigid.relaxation(self._stiffness(), a.pairs, moments, m, tau)
-            self.motion = self.relax(rigid.velocities(forces, moments, m))
+                self.carried = self.motion
+                self.relax = rigid.relaxation(self._stiffness(), a.pairs, moments, m, tau, self.carried)
+            self.motion = self.relax(free)
 
         # Fluxes (20), (21)
         #   rate rho_a = 1/m_a sum_p w_p [ -D grad N_a . grad W_p + rho_p grad N_a . v_adv ]

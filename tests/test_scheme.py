@@ -202,17 +202,22 @@ def test_a_rigid_translation_carries_the_centre_of_mass(ranks: Ranks, dim: int, 
 @pytest.mark.parametrize("model", [HUANG, WANG], ids=["huang", "wang"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_relaxed_contacts_are_an_implicit_step_of_the_forces(ranks: Ranks, dim: int, model: Tree) -> None:
-    """V_tau is the motion under the forces that it leaves behind after tau: those of
-    rho - tau sum_c V_c . grad(rho eta_c^2) [wang: grad(rho eta_c)] at the points. Both sides are linear in V_tau: what
-    differs is the round-off of a solve whose condition, the free motion over the relaxed one, is below 1000.
+    """V_tau is the motion under the forces that its departure from the carried motion V_0 leaves behind after tau:
+    those of rho - tau sum_c (V_c - V_0c) . grad(rho eta_c^2) [wang: grad(rho eta_c)] at the points. Both sides are
+    linear in V_tau: what differs is the round-off of a solve whose condition, the free motion over the relaxed one, is
+    below 1000.
     """
     case, tau = small_case(dim, LME, model, particles=2), 0.01
     mesh = build_mesh(case, ranks)
     scheme, state = prepare(case, mesh, ranks)
     rates_of(scheme, state)
     free = scheme.motion.copy()
+    carried = np.random.default_rng(3).normal(size=free.shape)
+    scheme.motion = carried
     scheme.rates(state.u, np.zeros_like(state.u), tau)
+    relaxed = scheme.motion.copy()
     rates_of(scheme, state)
+    np.testing.assert_array_equal(scheme.motion, relaxed)
     N, dN = dense(scheme)
     u = state.u[:, :3]
     rho, eta = N @ u[:, 0], N @ u[:, 1:]
@@ -220,14 +225,51 @@ def test_relaxed_contacts_are_an_implicit_step_of_the_forces(ranks: Ranks, dim: 
     for a in range(2):
         q = eta[:, a] ** 2 if model == HUANG else eta[:, a]
         dq = 2 * eta[:, a, None] * slopes[:, a] if model == HUANG else slopes[:, a]
-        V = velocity(scheme.motion[a], mesh.points - np.array(case.domain.size) / 2)
+        V = velocity(relaxed[a] - carried[a], mesh.points - np.array(case.domain.size) / 2)
         rho = rho - tau * (V * (q[:, None] * slope + (N @ u[:, 0])[:, None] * dq)).sum(axis=1)
     later = reference.bodies(rho, eta, slopes, mesh.weights, mesh.points, case.model)
     for a in range(2):
-        V = velocity(scheme.motion[a], mesh.points - np.array(case.domain.size) / 2)
+        V = velocity(relaxed[a], mesh.points - np.array(case.domain.size) / 2)
         expected = later.velocity(a, mesh.points, case.model)
         np.testing.assert_allclose(V, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-    assert np.abs(scheme.motion).max() < 0.5 * np.abs(free).max()
+    assert np.abs(relaxed).max() < 0.5 * np.abs(free).max()
+
+
+def test_the_touching_share_is_the_cut_of_a_ball() -> None:
+    """In space: the part of a ball, whose volume is the cell's, on one side of a plane, by slices across the plane."""
+    eta, slope, w = np.array([0.4, 0.3]), np.array([[0.05, 0.02, 0.0], [-0.02, 0.07, 0.05]]), 0.7
+    point = np.vstack([[1.0, *eta], np.hstack([np.zeros((3, 1)), slope.T])])
+    gradient = eta[0] * slope[1] + eta[1] * slope[0]
+    steepness, radius = np.linalg.norm(gradient), (w / (4 / 3 * np.pi)) ** (1 / 3)
+    for height in (-1.2, -1.0, -0.6, -0.1, 0.0, 0.3, 0.9, 1.0, 1.2):
+        level = eta.prod() - height * radius * steepness  # the plane lies `height` radii below the point
+        z = np.linspace(-1.0, 1.0, 200_001)
+        slices = np.pi * (1.0 - z**2) * (z > -height)
+        exact = np.trapezoid(slices, z) / (4 / 3 * np.pi)
+        assert kernels.touching_share(point, 0, 1, 2, w, 3, level) == pytest.approx(exact, abs=2e-5)
+        given = reference.touching_share(eta[:1], eta[1:], slope[:1], slope[1:], np.array([w]), level)
+        assert given[0] == pytest.approx(exact, abs=2e-5)
+
+
+def test_contact_forces_follow_a_sliding_particle_without_jumps(ranks: Ranks) -> None:
+    """Points that come above the threshold one by one would give steps as large as the change over a whole spacing;
+    with cells that do so by and by, the force changes in a tenth of a spacing by about a tenth of that."""
+    forces = []
+    for x in np.linspace(17.0, 16.0, 41):
+        tree = {
+            "domain": {"size": [25.0, 14.0]},
+            "nodes": {"spacing": 1.0},
+            "particles": {"centres": [[7.1, 7.0], [x, 7.3]], "radii": [4.8, 4.9]},
+            "time": {"end": 1.0},
+        }
+        case = parse_case(tree)
+        scheme, state = prepare(case, build_mesh(case, ranks), ranks)
+        rates_of(scheme, state)
+        forces.append(scheme.forces[0, 0])
+    steps = np.abs(np.diff(forces))
+    print(steps.max(), np.ptp(forces))
+    assert np.ptp(forces) > 10.0
+    assert steps.max() < 0.1 * np.ptp(forces)
 
 
 def velocity(motion: Floats, x: Floats) -> Floats:

@@ -81,6 +81,7 @@ def run(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", file_okay=False, help="Run directory; default: runs/CASE.")
     ] = None,
+    profile: Annotated[bool, typer.Option("--profile", help="Print where the time of each rank went.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Run one case here; Ctrl-C writes a checkpoint and ends."""
@@ -91,7 +92,7 @@ def run(
         resumable = (directory / "checkpoint.h5").exists()
         way = f"`frit resume {directory}` goes on with it" if resumable else "it has no checkpoint: remove it"
         refuse(f"--out {directory}: holds a run already (state: {state})", f"{way}, or name another folder")
-    follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json)
+    follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json, profile)
 
 
 @app.command()
@@ -193,7 +194,7 @@ def check_case(path: Path) -> None:
 # --- following a launch ---------------------------------------------------------------------------------
 
 
-def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool) -> NoReturn:
+def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, profile: bool = False) -> NoReturn:
     """Launch the solver, show its progress to the end, and leave with the exit status of its outcome."""
     try:
         launch = Launch(ranks, arguments, directory)
@@ -207,6 +208,10 @@ def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool) -> 
                 bar.update(task, description=in_words(progress))
         outcome = launch.wait()
     report(directory, outcome, progress, monotonic() - start, as_json)
+    if profile and (seconds := read_record(directory).get("profile")):
+        from frit.solver.profile import table
+
+        typer.echo("\n" + table(seconds), err=as_json)
     raise typer.Exit(EXIT[outcome.state])
 
 

@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,9 @@ def main() -> int:
         state, message = execute(arguments, ranks, directory, requests)
     except BaseException as error:
         return give_up(error, ranks, directory)
+    profile = [entry[0] for entry in ranks.everyones(np.array([ranks.watch.read()], dtype=object))]
     if ranks.root:
-        record_end(directory, state, message)
+        record_end(directory, state, message, profile=profile)
     return EXIT_STATUS[state]
 
 
@@ -245,11 +247,16 @@ def record_start(
     output.write_json(path, record)
 
 
-def record_end(directory: Path, state: str, message: str | None, retry: bool = False) -> None:
-    """How it ended, into run.json; the message into log.txt too. retry: the machinery broke, not the case."""
+def record_end(
+    directory: Path, state: str, message: str | None, retry: bool = False, profile: Sequence[Any] = ()
+) -> None:
+    """How it ended, into run.json; the message into log.txt too.
+
+    retry: the machinery broke, not the case; profile: per rank the seconds of each phase, see `profile.Stopwatch`.
+    """
     path = directory / "run.json"
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    record |= {"state": state, "message": message, "retry": retry, "end": output.now()}
+    record |= {"state": state, "message": message, "retry": retry, "end": output.now(), "profile": list(profile)}
     output.write_json(path, record)
     with open(directory / "log.txt", "a") as log:
         log.write(f"{output.now()} {state}{': ' + message if message else ''}\n")

@@ -60,7 +60,7 @@ def activate(d: Discretisation, state: State) -> Active:
     _spread(d, low, high)
     mixed = low < high
     if mixed.any():
-        flags[np.logical_or.reduceat(mixed[table.nodes], table.offsets[:-1])] = 1
+        kernels.switch_on(flags, mixed, table.offsets, table.nodes)
     live = np.flatnonzero(flags)
     mask = np.zeros((live.size, state.u.shape[1]))
     mask[:, 0] = 1.0
@@ -172,7 +172,7 @@ def _spread(d: Discretisation, low: Integers, high: Integers) -> None:
 def _touched(d: Discretisation, chosen: Flags) -> Flags:
     """Which nodes a chosen point of any rank sees."""
     touched = np.zeros(d.nodes, dtype=np.int8)
-    touched[d.shape.nodes[np.repeat(chosen, np.diff(d.shape.offsets))]] = 1
+    kernels.touch(touched, chosen, d.shape.offsets, d.shape.nodes)
     d.share.halo.most(touched)
     return touched.astype(bool)
 

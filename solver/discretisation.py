@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from . import kernels
 from .arrays import Floats, Numbers
 from .case import Case
 from .energy import Coefficients
 from .geometry import Mesh
+from .neighbours import Grid
 from .partition import Halo, Ranks, Share, bisect
 from .shape import ShapeError, ShapeTable, linear, lme
 
@@ -44,13 +45,13 @@ class Discretisation:
 
 
 def shape_table(
-    case: Case, points: Floats, spacing: Floats, cells: Numbers, nodes: Floats, tree: cKDTree | None = None
+    case: Case, points: Floats, spacing: Floats, cells: Numbers, nodes: Floats, grid: Grid | None = None
 ) -> ShapeTable:
-    """The shape functions that the case asks for, at points in the given cells; tree: of the nodes, if it exists."""
+    """The shape functions that the case asks for, at points in the given cells; grid: of the nodes, if it exists."""
     given = case.shape_functions
     if given.kind == "linear":
         return linear(points, cells, nodes)
-    return lme(points, spacing, nodes, given.gamma, given.tolerance, tree)
+    return lme(points, spacing, nodes, given.gamma, given.tolerance, grid)
 
 
 def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discretisation:
@@ -58,16 +59,17 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     part = bisect(mesh.points, activity, ranks.size)
     points = np.flatnonzero(part == ranks.rank)
     table = shape_table(case, mesh.points[points], mesh.spacing[points], mesh.cells[points], mesh.nodes)
-    seen = np.zeros(len(mesh.nodes), dtype=bool)
-    seen[table.nodes] = True
+    seen = np.zeros(len(mesh.nodes), dtype=np.int8)
+    kernels.touch(seen, np.ones(points.size, dtype=bool), table.offsets, table.nodes)
     nodes = np.flatnonzero(seen)
     local = np.full(len(mesh.nodes), -1, dtype=np.int32)
     local[nodes] = np.arange(nodes.size, dtype=np.int32)
-    table = ShapeTable(table.offsets, local[table.nodes], table.rows, table.table)
+    kernels.renumber(table.nodes, local)
     share = Share(ranks, points, nodes, Halo(ranks, nodes), len(mesh.nodes))
     x = mesh.points[points] - 0.5 * np.asarray(case.domain.size)
     weights = np.ascontiguousarray(mesh.weights[points])
-    mass, first_moment = _moments(table, weights, x, nodes.size)
+    mass, first_moment = np.zeros(nodes.size), np.zeros((nodes.size, x.shape[1]))
+    kernels.nodal_moments(mass, first_moment, weights, x, table.offsets, table.nodes, table.rows, table.table)
     share.halo.add(mass)
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
@@ -75,18 +77,6 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
         case, share, table, mesh.nodes[nodes], x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
-
-
-def _moments(table: ShapeTable, weights: Floats, x: Floats, nodes: int) -> tuple[Floats, Floats]:
-    """This rank's parts of m_a and q_a."""
-    counts = np.diff(table.offsets)
-    wN = np.repeat(weights, counts) * table.entries()[0]
-
-    def at_nodes(shares: Floats) -> Floats:
-        return np.asarray(np.bincount(table.nodes, shares, nodes), dtype=np.float64)
-
-    moment = [at_nodes(wN * np.repeat(x[:, k], counts)) for k in range(x.shape[1])]
-    return at_nodes(wN), np.stack(moment, axis=1)
 
 
 def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:
@@ -105,8 +95,5 @@ def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:
 def activity(mesh: Mesh, u: Floats, eps: float) -> Floats:
     """Expected work of each point (p,): 1 where a field varies over its cell by more than eps per nm, else 0.05."""
     varies = np.zeros(len(mesh.cells), dtype=bool)
-    for column in u.T:
-        if column.any():
-            corner = column[mesh.cells]
-            varies |= corner.max(axis=1) - corner.min(axis=1) > eps * mesh.spacing
+    kernels.variation(varies, mesh.cells, u, eps * mesh.spacing)
     return np.where(varies, 1.0, 0.05)

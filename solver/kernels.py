@@ -12,7 +12,7 @@ their derivatives.
 
 import numpy as np
 
-from .arrays import Flags, Floats, Integers, Numbers
+from .arrays import Bytes, Flags, Floats, Integers, Numbers
 from .energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
 from .simd import LANES, first, load, positive, splat, store, total, with_first
@@ -591,6 +591,62 @@ def add_moments(
                 moments[a, 0] += mass[b] * eta
                 for k in range(first_moment.shape[1]):
                     moments[a, 1 + k] += first_moment[b, k] * eta
+
+
+@jit
+def nodal_moments(
+    mass: Floats, first_moment: Floats, weights: Floats, x: Floats,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+) -> None:
+    """m_a += w_p N_a(x_p) and q_a += w_p x_p N_a(x_p) over this rank's points   (22)"""
+    for p in range(weights.size):
+        for i in range(offsets[p + 1] - offsets[p]):
+            a = nodes[offsets[p] + i]
+            share = weights[p] * table[0, rows[p] + i]
+            mass[a] += share
+            for k in range(x.shape[1]):
+                first_moment[a, k] += share * x[p, k]
+
+
+@jit
+def touch(touched: Bytes, chosen: Flags, offsets: Integers, nodes: Numbers) -> None:
+    """touched[a] = 1 at the nodes that a chosen point sees."""
+    for p in range(chosen.size):
+        if chosen[p]:
+            for e in range(offsets[p], offsets[p + 1]):
+                touched[nodes[e]] = 1
+
+
+@jit
+def switch_on(flags: Numbers, marked: Flags, offsets: Integers, nodes: Numbers) -> None:
+    """flags[p] = 1 at the points that see a marked node."""
+    for p in range(flags.size):
+        for e in range(offsets[p], offsets[p + 1]):
+            if marked[nodes[e]]:
+                flags[p] = 1
+                break
+
+
+@jit
+def renumber(nodes: Numbers, new: Numbers) -> None:
+    """Replace every node's number by its new one, in place."""
+    for e in range(nodes.size):
+        nodes[e] = new[nodes[e]]
+
+
+@jit
+def variation(varies: Flags, cells: Numbers, u: Floats, least: Floats) -> None:
+    """varies[c]: whether a field differs by more than least[c] between two corners of cell c."""
+    for c in range(cells.shape[0]):
+        for column in range(u.shape[1]):
+            low = u[cells[c, 0], column]
+            high = low
+            for k in range(1, cells.shape[1]):
+                low = min(low, u[cells[c, k], column])
+                high = max(high, u[cells[c, k], column])
+            if high - low > least[c]:
+                varies[c] = True
+                break
 
 
 @jit

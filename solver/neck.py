@@ -7,6 +7,7 @@ from .arrays import Floats, Numbers
 from .case import Case
 from .discretisation import shape_table
 from .geometry import Mesh
+from .neighbours import make_grid
 
 # Where eta_1 = eta_2 crosses a cell's edges, by the number of its corners (in falling order) with eta_1 > eta_2.
 SECTIONS = {
@@ -23,7 +24,8 @@ class Neck:
 
     def __init__(self, case: Case, mesh: Mesh) -> None:
         self.case, self.mesh = case, mesh
-        self.tree, self.points = cKDTree(mesh.nodes), cKDTree(mesh.points)
+        self.grid = make_grid(mesh.nodes, 2.0 * float(np.median(mesh.spacing)))
+        self.points = cKDTree(mesh.points)
         size = np.asarray(case.domain.size)
         self.wall = np.asarray(((mesh.nodes <= 0.0) | (mesh.nodes >= size)).any(axis=1))
 
@@ -49,7 +51,7 @@ class Neck:
         points = self.mesh.nodes[numbers[inner]]
         _, nearest = self.points.query(points)
         spacing, no_cells = self.mesh.spacing[nearest], self.mesh.cells[:0]
-        table = shape_table(self.case, points, spacing, no_cells, self.mesh.nodes, self.tree)
+        table = shape_table(self.case, points, spacing, no_cells, self.mesh.nodes, self.grid)
         entries = fields[table.nodes] * table.entries()[0][:, None]
         values[inner] = np.add.reduceat(entries, table.offsets[:-1], axis=0)
         return values

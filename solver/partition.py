@@ -13,6 +13,7 @@ import mpi4py
 import numpy as np
 
 from .arrays import Array, Floats, Integers
+from .profile import Stopwatch
 
 mpi4py.rc.threads = False
 from mpi4py import MPI  # noqa: E402  (after the settings above)
@@ -25,6 +26,7 @@ class Ranks:
         self.comm = MPI.COMM_SELF if communicator is None else communicator
         self.rank: int = self.comm.Get_rank()
         self.size: int = self.comm.Get_size()
+        self.watch = Stopwatch()
 
     @classmethod
     def world(cls) -> "Ranks":
@@ -116,6 +118,10 @@ class Halo:
         """Replace each shared node's partial sum by the sum over its holders, in place; (n,) or (n, F)."""
         if not self.neighbours:
             return
+        with self.ranks.watch("halo"):
+            self._add(array)
+
+    def _add(self, array: Array) -> None:
         mine = array[self.shared]
         received = self._exchange(array)
         array[self.shared] = 0

@@ -74,7 +74,7 @@ class Relaxation:
 def relaxation(
     stiffness: Floats, pairs: Integers, moments: Floats, m: Coefficients, tau: float, carried: Floats
 ) -> Relaxation:
-    """The relaxation of this stiffness (pairs, 2, k, k), as `kernels.contact_stiffness` leaves it, summed over ranks."""
+    """The relaxation for a stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over ranks."""
     particles, size = len(moments), stiffness.shape[2]
     units = np.broadcast_to(np.eye(size)[:, None, :], (size, particles, size))
     M = np.stack([velocities(unit, moments, m) for unit in units], axis=2)

@@ -71,20 +71,25 @@ def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer
     case = scheme.d.case
     waiting = [event for event in events(case) if event.time > state.time or state.step == 0]
     integrator.restart(scheme, state)
+    watch = scheme.d.share.ranks.watch
+    watch.enter("steps")
     while waiting:
         limit = waiting[0].time if integrator.stops_at_events else waiting[-1].time
         if state.time < waiting[0].time:
             integrator.step(scheme, state, limit)
             check(scheme, state)
         for event in reached(waiting, state.time):
-            u = integrator.at(scheme, state, event.time) if state.step else state.u
-            if event.history:
-                observer.history(scheme, state, u, event.time)
-            if event.snapshot is not None:
-                observer.snapshot(event.snapshot, scheme, state, u, event.time)
+            with watch("output"):
+                u = integrator.at(scheme, state, event.time) if state.step else state.u
+                if event.history:
+                    observer.history(scheme, state, u, event.time)
+                if event.snapshot is not None:
+                    observer.snapshot(event.snapshot, scheme, state, u, event.time)
         if renew(scheme, state):
             integrator.restart(scheme, state)
-        if observer.after_step(scheme, state, integrator) and waiting:
+        with watch("output"):
+            ended = observer.after_step(scheme, state, integrator)
+        if ended and waiting:
             return False
     return True
 

@@ -27,6 +27,10 @@ class Scheme:
 
     def activate(self, state: State) -> None:
         """Choose the live points and slots for this state (it may move slots), and fit the work arrays. Collective."""
+        with self.d.share.ranks.watch("live points"):
+            self._activate(state)
+
+    def _activate(self, state: State) -> None:
         self.point = np.empty((0, 0))  # free the largest array before the next one is made
         self.active: Active = activate(self.d, state)
         points = self.active.live.size
@@ -50,6 +54,8 @@ class Scheme:
         """
         d, a, m, table = self.d, self.active, self.d.coefficients, self.d.shape
         moving = d.case.model.rigid_motion
+        watch = d.share.ranks.watch
+        before = watch.enter("gather")
 
         # Fields and gradients at the points (17), mobility (5), and the potential (24)
         #   W_a = 1/m_a sum_p w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]
@@ -58,6 +64,7 @@ class Scheme:
         self.W[a.nodes] /= d.mass[a.nodes]
 
         # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
+        watch.enter("rigid motion")
         if moving:
             forces, moments = self._bodies(u)
             free = rigid.velocities(forces, moments, m)
@@ -69,6 +76,7 @@ class Scheme:
         # Fluxes (20), (21)
         #   rate rho_a = 1/m_a sum_p w_p [ -D grad N_a . grad W_p + rho_p grad N_a . v_adv ]
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
+        watch.enter("scatter")
         kernels.clear(rate, a.nodes)
         kernels.divergence(
             rate, self.point, self.D, self.S2, self.W, self.motion, self.velocity,
@@ -79,6 +87,7 @@ class Scheme:
             kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
         d.share.halo.add(rate)
         kernels.divide(rate, d.mass, a.nodes)
+        watch.enter(before)
 
     def _stiffness(self) -> Floats:
         """How the contact forces answer to rigid motion, (pairs, 2, k, k) summed over the ranks, after `_gather`."""

@@ -5,16 +5,14 @@ functions of the same mesh. Both give a `ShapeTable`, the only thing that the ke
 """
 
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from .arrays import Codes, Floats, Integers, Numbers
 from .jit import jit
+from .neighbours import Grid, make_grid
 from .simd import LANES
 
-CHUNK = 65_536  # points whose neighbours are held as Python lists at one time
 CONVERGED = 1e-13  # |sum N (x - x_a)| / h; the consistency of the table is this times h
 NEWTON_STEPS = 60
 WIDER = 1.25  # factor on h at a point whose Newton iteration fails
@@ -99,49 +97,35 @@ def linear(points: Floats, cells: Numbers, nodes: Floats) -> ShapeTable:
 
 
 def lme(
-    points: Floats, spacing: Floats, nodes: Floats, gamma: float, tolerance: float, tree: "cKDTree | None" = None
+    points: Floats, spacing: Floats, nodes: Floats, gamma: float, tolerance: float, grid: Grid | None = None
 ) -> ShapeTable:
     """Local maximum-entropy functions of the nodes at the points.
 
     N_a(x) = exp(-beta |x - x_a|^2 + lambda . (x - x_a)) / Z with beta = gamma / h^2 and lambda such that
     sum_a N_a (x - x_a) = 0;  grad N_a = -N_a J^-1 (x - x_a),  J = sum_a N_a (x - x_a)(x - x_a)^T.
     N_a is dropped beyond `search_range`. points (p, dim) nm, spacing (p,) h at the points in nm, nodes (n, dim) nm;
-    tree: a k-d tree of the nodes, built when absent.
+    grid: of the nodes, made when absent.
 
     A point whose Newton iteration does not converge is tried again with h, and so the range, 1.25 times wider, up to
     8 times; ShapeError says which point defeats that. Source: Arroyo & Ortiz (2006), equations (24)-(33).
     """
-    tree = cKDTree(nodes) if tree is None else tree
-    counts, near, keys = _neighbours(points, spacing, nodes, tree, gamma, tolerance)
-    offsets = row_offsets(counts)
+    ranges = search_range(spacing, gamma, tolerance)
+    grid = make_grid(nodes, float(np.median(ranges)) if ranges.size else 1.0) if grid is None else grid
+    offsets, near = grid.within(points, ranges)
+    keys = np.empty(len(points), dtype=np.uint64)
+    arrange(near, keys, points, spacing, nodes, offsets)
     _, first, kind = np.unique(keys, return_index=True, return_inverse=True)
     table, residual = _solve(points[first], spacing[first], nodes, *_pick(offsets, near, first), gamma)
-    starts, table = pad_rows(row_offsets(counts[first]), table)
+    starts, table = pad_rows(row_offsets(np.diff(offsets)[first]), table)
     if not (failed := np.flatnonzero(~(residual[kind] <= CONVERGED))).size:
         return ShapeTable(offsets, near, starts[kind], table)
     rows = starts[kind]
     lists = np.split(near, offsets[1:-1])
     for p in failed:
         rows[p] = table.shape[1]
-        lists[p], more = _repair(int(p), points[p], spacing[p], nodes, tree, gamma, tolerance)
+        lists[p], more = _repair(int(p), points[p], spacing[p], grid, gamma, tolerance)
         table = np.concatenate([table, pad_rows(np.array([0, more.shape[1]]), more)[1]], axis=1)
     return ShapeTable(row_offsets(np.array([part.size for part in lists])), np.concatenate(lists), rows, table)
-
-
-def _neighbours(
-    points: Floats, spacing: Floats, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
-) -> tuple[Integers, Numbers, Codes]:
-    """Numbers of neighbours, the neighbours, and a key for each point's pattern; see `arrange`."""
-    counts, near, keys = [], [], np.empty(len(points), dtype=np.uint64)
-    for first in range(0, len(points), CHUNK):
-        part = slice(first, first + CHUNK)
-        lists = tree.query_ball_point(points[part], search_range(spacing[part], gamma, tolerance))
-        counts.append(np.fromiter(map(len, lists), np.int64, len(lists)))
-        near.append(np.fromiter(chain.from_iterable(lists), np.int32, int(counts[-1].sum())))
-        arrange(near[-1], keys[part], points[part], spacing[part], nodes, row_offsets(counts[-1]))
-    if not near:
-        return np.empty(0, np.int64), np.empty(0, np.int32), keys
-    return np.concatenate(counts), np.concatenate(near), keys
 
 
 def _pick(offsets: Integers, near: Numbers, chosen: Integers) -> tuple[Integers, Numbers]:
@@ -162,14 +146,14 @@ def _solve(
 
 
 def _repair(
-    p: int, point: Floats, spacing: float, nodes: Floats, tree: "cKDTree", gamma: float, tolerance: float
+    p: int, point: Floats, spacing: float, grid: Grid, gamma: float, tolerance: float
 ) -> tuple[Numbers, Floats]:
     """Neighbours and table rows of a point that needs a wider range, or ShapeError."""
     h = np.array([spacing])
     for _ in range(ATTEMPTS):
         h *= WIDER
-        counts, near, _ = _neighbours(point[None], h, nodes, tree, gamma, tolerance)
-        table, residual = _solve(point[None], h, nodes, row_offsets(counts), near, gamma)
+        offsets, near = grid.within(point[None], search_range(h, gamma, tolerance))
+        table, residual = _solve(point[None], h, grid.nodes, offsets, near, gamma)
         if residual[0] <= CONVERGED:
             return near, table
     r = float(search_range(h, gamma, tolerance)[0])

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import Floats, Integers
-from .jit import jit
+from .jit import inlined, jit
 
 TANGENTIAL = 2.0 / 7.0  # stiffness over that of the normal: equal frequencies of both for a solid sphere
 SKIN = 0.3  # pairs nearer than this are listed; the list lasts while nobody has moved by a quarter of it
@@ -232,7 +232,6 @@ def pair_forces(
     largest, pushed, pairs = 0.0, 0.0, 0
     reach, friction, cohesion = physics.reach, physics.friction, physics.cohesion
     fade, start, partner = cohesion / max(reach, 1e-12), contacts.start, contacts.partner
-    normal = np.empty(3)
     for i in range(len(r)):
         x0, x1, x2, radius = x[i, 0], x[i, 1], x[i, 2], r[i]
         f0, f1, f2 = 0.0, 0.0, 0.0
@@ -257,8 +256,8 @@ def pair_forces(
                 f = max(-gap + damping * closing, 0.0) - cohesion
                 largest, pushed, pairs = max(largest, -gap), pushed - gap, pairs + 1
                 if friction > 0.0:
-                    normal[0], normal[1], normal[2] = n0, n1, n2
-                    rub(force, torque, i, j, p, v, spin, r, normal, closing, damping, -gap, contacts.slip, physics)
+                    slip = contacts.slip[p]
+                    rub(force, torque, i, j, v, spin, r, (n0, n1, n2), closing, damping, -gap, slip, physics)
             f0, f1, f2 = f0 + f * n0, f1 + f * n1, f2 + f * n2
             force[j, 0] -= f * n0
             force[j, 1] -= f * n1
@@ -269,39 +268,49 @@ def pair_forces(
     return largest, pushed, pairs
 
 
-@jit
+@inlined
 def rub(
-    force: Floats, torque: Floats, i: int, j: int, p: int, v: Floats, spin: Floats, r: Floats, normal: Floats,
-    closing: float, damping: float, overlap: float, slip: Floats, physics: Physics,
+    force: Floats, torque: Floats, i: int, j: int, v: Floats, spin: Floats, r: Floats,
+    normal: tuple[float, float, float], closing: float, damping: float, overlap: float, slip: Floats, physics: Physics,
 ) -> None:  # fmt: skip
-    """Add the tangential force of the contact p of i and j, and turn its slip with it.
+    """Add the tangential force of the contact of i and j, and let its slip (3,) follow.
 
     Slip velocity at the contact: v_i - v_j + closing n - (R_i w_i + R_j w_j) x n, for n pointing from j to i.
     """
-    slide = np.empty(3)
-    rate, along = 0.0, 0.0
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        turn_a = r[i] * spin[i, a] + r[j] * spin[j, a]
-        turn_b = r[i] * spin[i, b] + r[j] * spin[j, b]
-        slide[k] = v[i, k] - v[j, k] + closing * normal[k] - (turn_a * normal[b] - turn_b * normal[a])
-        along += slip[p, k] * normal[k]
-    for k in range(3):
-        slip[p, k] += physics.dt * slide[k] - along * normal[k]
-        slide[k] = -TANGENTIAL * slip[p, k] - damping * slide[k]
-        rate += slide[k] ** 2
-    scale = min(1.0, physics.friction * overlap / max(math.sqrt(rate), 1e-30))
-    for k in range(3):
-        slide[k] *= scale
-        if scale < 1.0:
-            slip[p, k] = -slide[k] / TANGENTIAL
-        force[i, k] += slide[k]
-        force[j, k] -= slide[k]
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        twist = normal[a] * slide[b] - normal[b] * slide[a]
-        torque[i, k] -= r[i] * twist
-        torque[j, k] -= r[j] * twist
+    n0, n1, n2 = normal
+    w0, w1, w2 = (
+        r[i] * spin[i, 0] + r[j] * spin[j, 0], r[i] * spin[i, 1] + r[j] * spin[j, 1],
+        r[i] * spin[i, 2] + r[j] * spin[j, 2],
+    )  # fmt: skip
+    u0 = v[i, 0] - v[j, 0] + closing * n0 - (w1 * n2 - w2 * n1)
+    u1 = v[i, 1] - v[j, 1] + closing * n1 - (w2 * n0 - w0 * n2)
+    u2 = v[i, 2] - v[j, 2] + closing * n2 - (w0 * n1 - w1 * n0)
+    # The slip stays in the plane of the contact.
+    along = slip[0] * n0 + slip[1] * n1 + slip[2] * n2
+    s0, s1, s2 = (
+        slip[0] + physics.dt * u0 - along * n0, slip[1] + physics.dt * u1 - along * n1,
+        slip[2] + physics.dt * u2 - along * n2,
+    )  # fmt: skip
+    t0, t1, t2 = -TANGENTIAL * s0 - damping * u0, -TANGENTIAL * s1 - damping * u1, -TANGENTIAL * s2 - damping * u2
+    size, limit = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2), physics.friction * overlap
+    if size > limit:
+        scale = limit / size
+        t0, t1, t2 = scale * t0, scale * t1, scale * t2
+        s0, s1, s2 = -t0 / TANGENTIAL, -t1 / TANGENTIAL, -t2 / TANGENTIAL
+    slip[0], slip[1], slip[2] = s0, s1, s2
+    force[i, 0] += t0
+    force[i, 1] += t1
+    force[i, 2] += t2
+    force[j, 0] -= t0
+    force[j, 1] -= t1
+    force[j, 2] -= t2
+    m0, m1, m2 = n1 * t2 - n2 * t1, n2 * t0 - n0 * t2, n0 * t1 - n1 * t0
+    torque[i, 0] -= r[i] * m0
+    torque[i, 1] -= r[i] * m1
+    torque[i, 2] -= r[i] * m2
+    torque[j, 0] -= r[j] * m0
+    torque[j, 1] -= r[j] * m1
+    torque[j, 2] -= r[j] * m2
 
 
 @jit

@@ -22,10 +22,11 @@ REST = 2e-3  # root mean square of the speeds of a heap that rests under its fir
 LAST = 0.3  # of that, in the end
 STAGES, MOST, LOWER = 2, 8, 0.07  # gravity is lowered so often, or more often if it must, each time to this part
 LONGEST = 500  # times 100 steps, for each
-THICK = 0.02  # drag of the later stages
-DRAG = 0.1  # of the medium in which a heap is pressed
+CALM = 0.02  # drag of the later stages
+DRAG = 0.1  # of the medium in which a heap relaxes
+THICK = 0.4  # of that in which it is pressed: what gives way does not shake the others, or equal discs would order
 STRAIN = 1e-3  # of the press, per step: neighbours approach by 0.002 radii
-YIELDING = 0.02  # overlap at which the press waits for the heap to give way
+YIELDING = 0.01  # overlap at which the press waits for the heap to give way
 PATIENCE = 60  # times 50 steps, for which it waits
 COHESION, REACH = 4e-4, 0.15  # pull of neighbours, and the gap across which they feel it
 HEAT = 0.04  # thermal velocity of shaking at its start, which makes overlaps of as much
@@ -79,7 +80,7 @@ class Heap:
         self._lower(solid / SETTLED[self.dim], friction=friction, lid=False)
         first = gravity = 0.02 / max(0.5 * solid, 1.0)
         for stage in range(MOST):
-            drag, slow = gravity / FALL + (THICK if stage else 0.0), REST * (gravity / first) ** 0.5
+            drag, slow = gravity / FALL + (CALM if stage else 0.0), REST * (gravity / first) ** 0.5
             strain = self._until_slow(slow, gravity=gravity, friction=friction, drag=drag, lid=False)
             if stage >= STAGES and strain.overlap < RESTING:
                 self._until_slow(LAST * slow, gravity=gravity, friction=friction, drag=drag, lid=False)
@@ -102,15 +103,15 @@ class Heap:
         """Lower the top of the box from that of the pile to the height, and all below with it; False: it jams."""
         up, waited = self.up, 0
         self.high[up] = self.top
-        strain = self.march(25, drag=DRAG, **physics)
+        strain = self.march(25, drag=THICK, **physics)
         while self.high[up] > height * (1.0 + 1e-12):
             if strain.overlap > YIELDING:
                 if waited == PATIENCE:
                     return False
-                waited, strain = waited + 1, self.march(50, drag=DRAG, **physics)
+                waited, strain = waited + 1, self.march(50, drag=THICK, **physics)
                 continue
             waited, squeeze = 0, 1.0 - (height / self.high[up]) ** (1.0 / 25.0)
-            strain = self.march(25, drag=DRAG, squeeze=min(squeeze, STRAIN), **physics)
+            strain = self.march(25, drag=THICK, squeeze=min(squeeze, STRAIN), **physics)
         return True
 
     def relax(self) -> bool:

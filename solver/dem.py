@@ -17,7 +17,7 @@ from .arrays import Floats, Integers
 from .jit import inlined, jit
 
 TANGENTIAL = 2.0 / 7.0  # stiffness over that of the normal: equal frequencies of both for a solid sphere
-SKIN = 0.3  # pairs nearer than this are listed; the list lasts while nobody has moved by a quarter of it
+SKIN = 0.3  # pairs nearer than this are listed; the list lasts while nobody has moved by a quarter of it, see `moved`
 
 
 class Physics(NamedTuple):

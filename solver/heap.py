@@ -3,6 +3,7 @@
 Lengths are in units of the mean radius and measured from the container's lower corner; see dem.py for the forces.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,13 @@ HEAT = 0.04  # thermal velocity of shaking at its start, which makes overlaps of
 class Heap:
     """Particles with centres x (n, 3) and radii r (n,); in 2-D the third component is 0."""
 
-    def __init__(self, r: Floats, box: Floats, rng: np.random.Generator) -> None:
-        """Cohesive settling: each particle stays where it first touches. The pile may be higher than the box (dim,)."""
+    def __init__(
+        self, r: Floats, box: Floats, rng: np.random.Generator, pause: Callable[[], None] = lambda: None
+    ) -> None:
+        """Cohesive settling: each particle stays where it first touches. The pile may be higher than the box (dim,).
+
+        pause is called between batches of at most 100 steps; what it raises ends the work.
+        """
         n, self.dim = len(r), len(box)
         self.up = self.dim - 1
         self.r = r.copy()
@@ -45,7 +51,7 @@ class Heap:
         self.high[: self.dim] = box
         self.x, self.v, self.spin = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self.contacts = dem.no_contacts()
-        self.rng = rng
+        self.rng, self.pause = rng, pause
         level = float(volumes(self.r, self.dim).sum() / np.prod(box[:-1])) / LOOSEST[self.dim]
         dem.deposit(self.x, self.r, rng.random((n, TRIES, self.up)), self.low, self.high, self.dim, level)
         # Neighbours in space become neighbours in memory.
@@ -63,6 +69,7 @@ class Heap:
             "gravity": 0.0, "friction": 0.0, "cohesion": 0.0, "reach": 0.0, "damping": 0.3, "drag": 0.0,
             "squeeze": 0.0, "lid": True, "dt": DT,
         } | physics  # fmt: skip
+        self.pause()
         self.contacts, strain = dem.march(
             self.x, self.v, self.spin, self.r, self.low, self.high,
             dem.Physics(self.dim, **given), self.contacts, steps,
@@ -73,11 +80,12 @@ class Heap:
     def pour(self, friction: float) -> None:
         """Let gravity pull until all is at rest.
 
-        The weight of all layers presses the lowest particles in by some per cent; once at rest, gravity is lowered,
+        What the pile would fall is taken first, by a press without a lid or friction: in as many steps for a high pile
+        as for a low one. The weight of all layers presses the lowest particles in by some per cent; once at rest, gravity is lowered,
         each time to rest, until the largest overlap is small.
         """
         solid = float(volumes(self.r, self.dim).sum()) / float(np.prod(self.high[: self.up]))
-        self._lower(solid / SETTLED[self.dim], friction=friction, lid=False)
+        self._lower(solid / SETTLED[self.dim], drag=DRAG, lid=False)
         first = gravity = 0.02 / max(0.5 * solid, 1.0)
         for stage in range(MOST):
             drag, slow = gravity / FALL + (CALM if stage else 0.0), REST * (gravity / first) ** 0.5
@@ -97,21 +105,21 @@ class Heap:
 
     def press(self, height: float) -> bool:
         """Lower the lid to the height, waiting where the heap resists, then relax; False: it jams, at high[up]."""
-        return self._lower(height) and self.relax()
+        return self._lower(height, drag=THICK) and self.relax()
 
     def _lower(self, height: float, **physics: float) -> bool:
         """Lower the top of the box from that of the pile to the height, and all below with it; False: it jams."""
         up, waited = self.up, 0
         self.high[up] = self.top
-        strain = self.march(25, drag=THICK, **physics)
+        strain = self.march(25, **physics)
         while self.high[up] > height * (1.0 + 1e-12):
             if strain.overlap > YIELDING:
                 if waited == PATIENCE:
                     return False
-                waited, strain = waited + 1, self.march(50, drag=THICK, **physics)
+                waited, strain = waited + 1, self.march(50, **physics)
                 continue
             waited, squeeze = 0, 1.0 - (height / self.high[up]) ** (1.0 / 25.0)
-            strain = self.march(25, drag=THICK, squeeze=min(squeeze, STRAIN), **physics)
+            strain = self.march(25, squeeze=min(squeeze, STRAIN), **physics)
         return True
 
     def relax(self) -> bool:

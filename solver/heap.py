@@ -81,8 +81,8 @@ class Heap:
         """Let gravity pull until all is at rest.
 
         What the pile would fall is taken first, by a press without a lid or friction: in as many steps for a high pile
-        as for a low one. The weight of all layers presses the lowest particles in by some per cent; once at rest, gravity is lowered,
-        each time to rest, until the largest overlap is small.
+        as for a low one. The weight of all layers presses the lowest particles in by some per cent; once at rest,
+        gravity is lowered, each time to rest, until the largest overlap is small.
         """
         solid = float(volumes(self.r, self.dim).sum()) / float(np.prod(self.high[: self.up]))
         self._lower(solid / SETTLED[self.dim], drag=DRAG, lid=False)

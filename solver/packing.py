@@ -171,12 +171,17 @@ class Trials:
         self.ratios: list[float] = []
         self.fractions: list[float] = []
         self.jams: list[float] = []  # counts with which heaps would have jammed at the height of the container
-        self.floor = 1  # below this count the pile does not reach the lid
+        self.shorts: list[float] = []  # counts with which piles that were too low would have reached the lid
 
     def reached(self, fraction: float, count: int) -> None:
         """A packing with this fraction was made."""
         self.fractions.append(fraction)
         self.ratios.append(fraction / (count * self.per_particle))
+
+    @property
+    def floor(self) -> int:
+        """Count whose pile reaches the lid every other time: one that was too low does not rule out its count."""
+        return max(1, round(0.97 * float(np.mean(self.shorts)))) if self.shorts else 1
 
     @property
     def ceiling(self) -> float:
@@ -244,7 +249,7 @@ def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | N
     heap, unit = _start(wanted, count, trial)
     height, pile = float(wanted.size[-1]) / unit, heap.top
     if pile < height:
-        seen.floor = max(seen.floor, math.ceil(count * height / pile))
+        seen.shorts.append(count * height / pile)
         return None
     exchange = bool(wanted.particles.exchange)
     if not (heap.anneal(height, ROUNDS) if exchange else heap.press(height)):

@@ -69,6 +69,10 @@ def read_arguments() -> argparse.Namespace:
     return arguments
 
 
+class StopError(Exception):
+    """The end was asked for where there is nothing to keep."""
+
+
 class Requests:
     """What signals have asked for: a checkpoint (USR1), or the end (TERM, INT). Heard from the start of `main`."""
 
@@ -83,6 +87,11 @@ class Requests:
         else:
             self.end = True
 
+    def heed(self) -> None:
+        """Raises `StopError` once the end was asked for."""
+        if self.end:
+            raise StopError
+
 
 def execute(
     arguments: argparse.Namespace, ranks: Ranks, directory: Path, requests: Requests
@@ -90,7 +99,10 @@ def execute(
     """The whole run: how it ended, and a message where it did not end well."""
     fresh = arguments.resume is None
     asked: Case = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
-    case, packing = ranks.from_root(place(asked, directory, fresh) if ranks.root else None)
+    placed = ranks.from_root(place_or_stop(asked, directory, fresh, requests) if ranks.root else None)
+    if placed is None:
+        return "interrupted", "while the particles were packed: nothing to resume, run it again"
+    case, packing = placed
     mesh, identity = build_mesh(case, ranks), asked.identity()
     kept = None if fresh else ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
     scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
@@ -114,6 +126,16 @@ def execute(
     finally:
         recorder.close()
     return ("done", None) if finished else ("interrupted", f"checkpoint at t = {state.time:.6g}")
+
+
+def place_or_stop(
+    asked: Case, directory: Path, fresh: bool, requests: Requests
+) -> tuple[Case, dict[str, Any] | None] | None:
+    """Rank 0: the case with its particles and what they are like (see `place`); None: the end was asked for."""
+    try:
+        return place(asked, directory, fresh, requests.heed)
+    except StopError:
+        return None
 
 
 def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:

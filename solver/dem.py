@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import Floats, Integers
-from .jit import jit
+from .jit import inlined, jit
 
 TANGENTIAL = 2.0 / 7.0  # stiffness over that of the normal: equal frequencies of both for a solid sphere
-SKIN = 0.3  # pairs nearer than this are listed; the list lasts while nobody has moved by a quarter of it
+SKIN = 0.3  # pairs nearer than this are listed; the list lasts while nobody has moved by a quarter of it, see `moved`
 
 
 class Physics(NamedTuple):
@@ -42,6 +42,7 @@ class Contacts(NamedTuple):
     partner: Integers
     slip: Floats
     x: Floats
+    squeezed: Floats  # (1,) by which part since then
 
 
 class Strain(NamedTuple):
@@ -50,11 +51,12 @@ class Strain(NamedTuple):
     overlap: float  # the largest, walls included
     force: float  # mean normal force of pairs that overlap
     speed: float  # of the fastest particle
+    work: int  # listed pairs, summed over the steps
 
 
 def no_contacts() -> Contacts:
     """Before the first search."""
-    return Contacts(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
+    return Contacts(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.zeros(1))
 
 
 @jit
@@ -148,21 +150,35 @@ def search(x: Floats, r: Floats, old: Contacts) -> Contacts:
                 for q in range(start[i], start[i + 1]):
                     if partner[q] == old.partner[p]:
                         slip[q] = old.slip[p]
-    return Contacts(start, partner[:found].copy(), slip, x.copy())
+    return Contacts(start, partner[:found].copy(), slip, x.copy(), np.zeros(1))
 
 
 @jit
-def moved(x: Floats, contacts: Contacts) -> bool:
-    """Whether a pair that is not listed may have come within reach."""
+def moved(x: Floats, r: Floats, contacts: Contacts) -> bool:
+    """Whether a pair that is not listed may have come within reach: by motions, and by what squeezing has added."""
     if len(contacts.x) != len(x):
+        return True
+    allowed = 0.25 * SKIN - 0.5 * contacts.squeezed[0] * (2.0 * r.max() + SKIN)
+    if allowed <= 0.0:
         return True
     for i in range(len(x)):
         d = 0.0
         for k in range(3):
             d += (x[i, k] - contacts.x[i, k]) ** 2
-        if d > (0.25 * SKIN) ** 2:
+        if d > allowed**2:
             return True
     return False
+
+
+@jit
+def squeeze(x: Floats, low: Floats, high: Floats, up: int, part: float, contacts: Contacts) -> None:
+    """The box and all in it lose this part of their height. The places of the last search follow, so that only what
+    moves against its surroundings asks for the next one."""
+    high[up] = low[up] + (high[up] - low[up]) * (1.0 - part)
+    for places in (x, contacts.x):
+        for i in range(len(places)):
+            places[i, up] = low[up] + (places[i, up] - low[up]) * (1.0 - part)
+    contacts.squeezed[0] += part
 
 
 @jit
@@ -176,29 +192,35 @@ def march(
     for i in range(n):
         mass[i] = max(r[i] ** dim, 0.3)  # light ones are as heavy as this: they would ask for shorter steps
     inertia = 0.4 if dim == 3 else 0.5
+    slowed = 1.0 / (1.0 + dt * physics.drag)
     force, torque = np.zeros((n, 3)), np.zeros((n, 3))
-    overlap, pushed, pairs = 0.0, 0.0, 0
+    overlap, pushed, pairs, work = 0.0, 0.0, 0, 0
     for _ in range(steps):
         if physics.squeeze != 0.0:
-            high[up] = low[up] + (high[up] - low[up]) * (1.0 - physics.squeeze)
-            for i in range(n):
-                x[i, up] = low[up] + (x[i, up] - low[up]) * (1.0 - physics.squeeze)
-        if moved(x, contacts):
+            squeeze(x, low, high, up, physics.squeeze, contacts)
+        if moved(x, r, contacts):
             contacts = search(x, r, contacts)
-        force[:], torque[:] = 0.0, 0.0
+        work += len(contacts.partner)
+        force[:] = 0.0
+        if physics.friction > 0.0:
+            torque[:] = 0.0
         overlap, pushed, pairs = pair_forces(force, torque, x, v, spin, r, mass, contacts, physics)
         overlap = max(overlap, wall_forces(force, x, v, r, mass, low, high, physics))
         for i in range(n):
             force[i, up] -= physics.gravity * mass[i]
+            push = dt / mass[i]
             for k in range(3):
-                v[i, k] = (v[i, k] + dt * force[i, k] / mass[i]) / (1.0 + dt * physics.drag)
+                v[i, k] = (v[i, k] + push * force[i, k]) * slowed
                 x[i, k] += dt * v[i, k]
-                turned = spin[i, k] + dt * torque[i, k] / (inertia * mass[i] * r[i] ** 2)
-                spin[i, k] = turned / (1.0 + dt * physics.drag)
+        if physics.friction > 0.0:
+            for i in range(n):
+                push = dt / (inertia * mass[i] * r[i] ** 2)
+                for k in range(3):
+                    spin[i, k] = (spin[i, k] + push * torque[i, k]) * slowed
     speed = 0.0
     for i in range(n):
         speed = max(speed, math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2))
-    return contacts, Strain(overlap, pushed / max(pairs, 1), speed)
+    return contacts, Strain(overlap, pushed / max(pairs, 1), speed, work)
 
 
 @jit
@@ -208,64 +230,87 @@ def pair_forces(
 ) -> tuple[float, float, int]:  # fmt: skip
     """Add what particles do to each other; the largest overlap, the sum of the normal forces, their number."""
     largest, pushed, pairs = 0.0, 0.0, 0
-    normal, slide = np.empty(3), np.empty(3)
+    reach, friction, cohesion = physics.reach, physics.friction, physics.cohesion
+    fade, start, partner = cohesion / max(reach, 1e-12), contacts.start, contacts.partner
     for i in range(len(r)):
-        for p in range(contacts.start[i], contacts.start[i + 1]):
-            j = contacts.partner[p]
-            apart = 0.0
-            for k in range(3):
-                normal[k] = x[i, k] - x[j, k]
-                apart += normal[k] ** 2
-            touching = r[i] + r[j]
-            if apart >= (touching + physics.reach) ** 2:
-                if physics.friction > 0.0:
+        x0, x1, x2, radius = x[i, 0], x[i, 1], x[i, 2], r[i]
+        f0, f1, f2 = 0.0, 0.0, 0.0
+        for p in range(start[i], start[i + 1]):
+            j = partner[p]
+            n0, n1, n2 = x0 - x[j, 0], x1 - x[j, 1], x2 - x[j, 2]
+            apart, touching = n0 * n0 + n1 * n1 + n2 * n2, radius + r[j]
+            if apart >= (touching + reach) ** 2:
+                if friction > 0.0:
                     contacts.slip[p] = 0.0
                 continue
             apart = max(math.sqrt(apart), 1e-12)
-            gap, closing = apart - touching, 0.0
-            for k in range(3):
-                normal[k] /= apart
-                closing -= (v[i, k] - v[j, k]) * normal[k]
-            damping = 2.0 * physics.damping * math.sqrt(mass[i] * mass[j] / (mass[i] + mass[j]))
+            gap = apart - touching
+            n0, n1, n2 = n0 / apart, n1 / apart, n2 / apart
             if gap >= 0.0:
-                f = -physics.cohesion * (1.0 - gap / max(physics.reach, 1e-12))
+                f = fade * gap - cohesion
+                if friction > 0.0:
+                    contacts.slip[p] = 0.0
             else:
-                f = max(-gap + damping * closing, 0.0) - physics.cohesion
+                damping = 2.0 * physics.damping * math.sqrt(mass[i] * mass[j] / (mass[i] + mass[j]))
+                closing = -((v[i, 0] - v[j, 0]) * n0 + (v[i, 1] - v[j, 1]) * n1 + (v[i, 2] - v[j, 2]) * n2)
+                f = max(-gap + damping * closing, 0.0) - cohesion
                 largest, pushed, pairs = max(largest, -gap), pushed - gap, pairs + 1
-            for k in range(3):
-                force[i, k] += f * normal[k]
-                force[j, k] -= f * normal[k]
-            if physics.friction == 0.0:
-                continue
-            if gap >= 0.0:
-                contacts.slip[p] = 0.0
-                continue
-            # Slip velocity at the contact: v_i - v_j + closing n - (R_i w_i + R_j w_j) x n, for n points from j to i.
-            rate, along = 0.0, 0.0
-            for k in range(3):
-                a, b = (k + 1) % 3, (k + 2) % 3
-                turn_a = r[i] * spin[i, a] + r[j] * spin[j, a]
-                turn_b = r[i] * spin[i, b] + r[j] * spin[j, b]
-                slide[k] = v[i, k] - v[j, k] + closing * normal[k] - (turn_a * normal[b] - turn_b * normal[a])
-                along += contacts.slip[p, k] * normal[k]
-            for k in range(3):
-                contacts.slip[p, k] += physics.dt * slide[k] - along * normal[k]
-                slide[k] = -TANGENTIAL * contacts.slip[p, k] - damping * slide[k]
-                rate += slide[k] ** 2
-            limit = physics.friction * max(-gap, 0.0)
-            scale = min(1.0, limit / max(math.sqrt(rate), 1e-30))
-            for k in range(3):
-                slide[k] *= scale
-                if scale < 1.0:
-                    contacts.slip[p, k] = -slide[k] / TANGENTIAL
-                force[i, k] += slide[k]
-                force[j, k] -= slide[k]
-            for k in range(3):
-                a, b = (k + 1) % 3, (k + 2) % 3
-                twist = normal[a] * slide[b] - normal[b] * slide[a]
-                torque[i, k] -= r[i] * twist
-                torque[j, k] -= r[j] * twist
+                if friction > 0.0:
+                    slip = contacts.slip[p]
+                    rub(force, torque, i, j, v, spin, r, (n0, n1, n2), closing, damping, -gap, slip, physics)
+            f0, f1, f2 = f0 + f * n0, f1 + f * n1, f2 + f * n2
+            force[j, 0] -= f * n0
+            force[j, 1] -= f * n1
+            force[j, 2] -= f * n2
+        force[i, 0] += f0
+        force[i, 1] += f1
+        force[i, 2] += f2
     return largest, pushed, pairs
+
+
+@inlined
+def rub(
+    force: Floats, torque: Floats, i: int, j: int, v: Floats, spin: Floats, r: Floats,
+    normal: tuple[float, float, float], closing: float, damping: float, overlap: float, slip: Floats, physics: Physics,
+) -> None:  # fmt: skip
+    """Add the tangential force of the contact of i and j, and let its slip (3,) follow.
+
+    Slip velocity at the contact: v_i - v_j + closing n - (R_i w_i + R_j w_j) x n, for n pointing from j to i.
+    """
+    n0, n1, n2 = normal
+    w0, w1, w2 = (
+        r[i] * spin[i, 0] + r[j] * spin[j, 0], r[i] * spin[i, 1] + r[j] * spin[j, 1],
+        r[i] * spin[i, 2] + r[j] * spin[j, 2],
+    )  # fmt: skip
+    u0 = v[i, 0] - v[j, 0] + closing * n0 - (w1 * n2 - w2 * n1)
+    u1 = v[i, 1] - v[j, 1] + closing * n1 - (w2 * n0 - w0 * n2)
+    u2 = v[i, 2] - v[j, 2] + closing * n2 - (w0 * n1 - w1 * n0)
+    # The slip stays in the plane of the contact.
+    along = slip[0] * n0 + slip[1] * n1 + slip[2] * n2
+    s0, s1, s2 = (
+        slip[0] + physics.dt * u0 - along * n0, slip[1] + physics.dt * u1 - along * n1,
+        slip[2] + physics.dt * u2 - along * n2,
+    )  # fmt: skip
+    t0, t1, t2 = -TANGENTIAL * s0 - damping * u0, -TANGENTIAL * s1 - damping * u1, -TANGENTIAL * s2 - damping * u2
+    size, limit = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2), physics.friction * overlap
+    if size > limit:
+        scale = limit / size
+        t0, t1, t2 = scale * t0, scale * t1, scale * t2
+        s0, s1, s2 = -t0 / TANGENTIAL, -t1 / TANGENTIAL, -t2 / TANGENTIAL
+    slip[0], slip[1], slip[2] = s0, s1, s2
+    force[i, 0] += t0
+    force[i, 1] += t1
+    force[i, 2] += t2
+    force[j, 0] -= t0
+    force[j, 1] -= t1
+    force[j, 2] -= t2
+    m0, m1, m2 = n1 * t2 - n2 * t1, n2 * t0 - n0 * t2, n0 * t1 - n1 * t0
+    torque[i, 0] -= r[i] * m0
+    torque[i, 1] -= r[i] * m1
+    torque[i, 2] -= r[i] * m2
+    torque[j, 0] -= r[j] * m0
+    torque[j, 1] -= r[j] * m1
+    torque[j, 2] -= r[j] * m2
 
 
 @jit

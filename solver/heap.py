@@ -3,6 +3,7 @@
 Lengths are in units of the mean radius and measured from the container's lower corner; see dem.py for the forces.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,20 @@ from .arrays import Floats, Integers
 from .pack_measures import near_pairs, touching, volumes
 
 LOOSEST = {2: 0.34, 3: 0.17}  # solid fraction of the pile between its walls, by dimension
+SETTLED = {2: 0.75, 3: 0.55}  # solid fraction from which gravity takes over
 TRIES = 30  # places above which a pile is level that a particle tries
 RESTING = 0.002  # largest overlap of a heap that counts as relaxed, with particles and with walls
-DT = 0.12  # in units of sqrt(mass / stiffness); contacts of the lightest particles are stable up to about 0.3
+DT = 0.2  # in units of sqrt(mass / stiffness); contacts of the lightest particles are stable up to about 0.3
 FALL = 0.1  # terminal velocity: a particle that lands is pressed in by about as much, for a moment
-REST = 0.01  # mean speed of a heap at rest, over that after a fall of half a radius; the fastest may have ten times it
-STAGES, LONGEST = 8, 500  # of lowering gravity; times 100 steps, for each
+REST = 2e-3  # root mean square of the speeds of a heap that rests under its first gravity
+LAST = 0.3  # of that, in the end
+STAGES, MOST, LOWER = 2, 8, 0.07  # gravity is lowered so often, or more often if it must, each time to this part
+LONGEST = 500  # times 100 steps, for each
+CALM = 0.02  # drag of the later stages
+DRAG = 0.1  # of the medium in which a heap relaxes
+THICK = 0.4  # of that in which it is pressed: what gives way does not shake the others, or equal discs would order
 STRAIN = 1e-3  # of the press, per step: neighbours approach by 0.002 radii
-YIELDING = 0.02  # overlap at which the press waits for the heap to give way
+YIELDING = 0.01  # overlap at which the press waits for the heap to give way
 PATIENCE = 60  # times 50 steps, for which it waits
 COHESION, REACH = 4e-4, 0.15  # pull of neighbours, and the gap across which they feel it
 HEAT = 0.04  # thermal velocity of shaking at its start, which makes overlaps of as much
@@ -29,18 +36,27 @@ HEAT = 0.04  # thermal velocity of shaking at its start, which makes overlaps of
 class Heap:
     """Particles with centres x (n, 3) and radii r (n,); in 2-D the third component is 0."""
 
-    def __init__(self, r: Floats, box: Floats, rng: np.random.Generator) -> None:
-        """Cohesive settling: each particle stays where it first touches. The pile may be higher than the box (dim,)."""
+    def __init__(
+        self, r: Floats, box: Floats, rng: np.random.Generator, pause: Callable[[], None] = lambda: None
+    ) -> None:
+        """Cohesive settling: each particle stays where it first touches. The pile may be higher than the box (dim,).
+
+        pause is called between batches of at most 100 steps; what it raises ends the work.
+        """
         n, self.dim = len(r), len(box)
         self.up = self.dim - 1
         self.r = r.copy()
         self.low, self.high = np.zeros(3), np.zeros(3)
+        self.work = 0  # listed pairs, summed over all steps
         self.high[: self.dim] = box
         self.x, self.v, self.spin = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self.contacts = dem.no_contacts()
-        self.rng = rng
+        self.rng, self.pause = rng, pause
         level = float(volumes(self.r, self.dim).sum() / np.prod(box[:-1])) / LOOSEST[self.dim]
         dem.deposit(self.x, self.r, rng.random((n, TRIES, self.up)), self.low, self.high, self.dim, level)
+        # Neighbours in space become neighbours in memory.
+        order = np.lexsort((self.x / (2.0 * self.r.max())).astype(np.int64)[:, : self.dim].T[::-1])
+        self.x, self.r = self.x[order], self.r[order]
 
     @property
     def top(self) -> float:
@@ -53,52 +69,65 @@ class Heap:
             "gravity": 0.0, "friction": 0.0, "cohesion": 0.0, "reach": 0.0, "damping": 0.3, "drag": 0.0,
             "squeeze": 0.0, "lid": True, "dt": DT,
         } | physics  # fmt: skip
+        self.pause()
         self.contacts, strain = dem.march(
             self.x, self.v, self.spin, self.r, self.low, self.high,
             dem.Physics(self.dim, **given), self.contacts, steps,
         )  # fmt: skip
+        self.work += strain[3]
         return dem.Strain(*strain)
 
     def pour(self, friction: float) -> None:
         """Let gravity pull until all is at rest.
 
-        The weight of all layers presses the lowest particles in by some per cent; once at rest, gravity is lowered,
-        each time to rest, until the largest overlap is small.
+        What the pile would fall is taken first, by a press without a lid or friction: in as many steps for a high pile
+        as for a low one. The weight of all layers presses the lowest particles in by some per cent; once at rest,
+        gravity is lowered, each time to rest, until the largest overlap is small.
         """
-        layers = float(volumes(self.r, self.dim).sum()) / float(np.prod(self.high[: self.up])) / 2.0
-        gravity, thick = 0.02 / max(layers, 1.0), 0.0
-        for _ in range(STAGES):
-            for _ in range(LONGEST):
-                drag = gravity / FALL + thick
-                strain = self.march(100, gravity=gravity, friction=friction, drag=drag, lid=False)
-                slow = REST * gravity**0.5
-                if strain.speed < 10.0 * slow and float(np.sqrt(np.mean(self.v**2))) < slow:
-                    break
-            if strain.overlap < RESTING:
+        solid = float(volumes(self.r, self.dim).sum()) / float(np.prod(self.high[: self.up]))
+        self._lower(solid / SETTLED[self.dim], drag=DRAG, lid=False)
+        first = gravity = 0.02 / max(0.5 * solid, 1.0)
+        for stage in range(MOST):
+            drag, slow = gravity / FALL + (CALM if stage else 0.0), REST * (gravity / first) ** 0.5
+            strain = self._until_slow(slow, gravity=gravity, friction=friction, drag=drag, lid=False)
+            if stage >= STAGES and strain.overlap < RESTING:
+                self._until_slow(LAST * slow, gravity=gravity, friction=friction, drag=drag, lid=False)
                 return
-            gravity, thick = 0.15 * gravity, 0.02
+            gravity *= LOWER
+
+    def _until_slow(self, slow: float, **physics: float) -> dem.Strain:
+        """March until the root mean square of the speeds is below `slow`, and none is above ten times that."""
+        for _ in range(LONGEST):
+            strain = self.march(100, **physics)
+            if strain.speed < 10.0 * slow and float(np.sqrt(np.mean(self.v**2))) < slow:
+                break
+        return strain
 
     def press(self, height: float) -> bool:
         """Lower the lid to the height, waiting where the heap resists, then relax; False: it jams, at high[up]."""
+        return self._lower(height, drag=THICK) and self.relax()
+
+    def _lower(self, height: float, **physics: float) -> bool:
+        """Lower the top of the box from that of the pile to the height, and all below with it; False: it jams."""
         up, waited = self.up, 0
         self.high[up] = self.top
-        strain = self.march(25, drag=0.1)
+        strain = self.march(25, **physics)
         while self.high[up] > height * (1.0 + 1e-12):
             if strain.overlap > YIELDING:
                 if waited == PATIENCE:
                     return False
-                waited, strain = waited + 1, self.march(50, drag=0.1)
+                waited, strain = waited + 1, self.march(50, **physics)
                 continue
             waited, squeeze = 0, 1.0 - (height / self.high[up]) ** (1.0 / 25.0)
-            strain = self.march(25, drag=0.1, squeeze=min(squeeze, STRAIN))
-        return self.relax()
+            strain = self.march(25, squeeze=min(squeeze, STRAIN), **physics)
+        return True
 
     def relax(self) -> bool:
         """Wait until overlaps are small; False where they do not become so."""
         for _ in range(4 * PATIENCE):
-            if self.march(50, drag=0.1).overlap < 0.5 * RESTING:
+            if self.march(50, drag=DRAG).overlap < 0.5 * RESTING:
                 return True
-        return self.march(50, drag=0.1).overlap < RESTING
+        return self.march(50, drag=DRAG).overlap < RESTING
 
     def anneal(self, height: float, rounds: int) -> bool:
         """Press to the height whatever the overlaps, then shake ever more gently while radii are exchanged."""
@@ -106,7 +135,7 @@ class Heap:
         self.high[up] = self.top
         while self.high[up] > height * (1.0 + 1e-12):
             squeeze = 1.0 - (height / self.high[up]) ** (1.0 / 25.0)
-            self.march(25, drag=0.1, squeeze=min(squeeze, STRAIN))
+            self.march(25, drag=DRAG, squeeze=min(squeeze, STRAIN))
         for k in range(rounds):
             velocity = HEAT * (1.0 - k / rounds)
             self.v[:, : self.dim] = self.rng.normal(scale=velocity, size=(n, self.dim))
@@ -119,7 +148,7 @@ class Heap:
     def stick(self) -> None:
         """Weak cohesion draws together what is near; what still floats is moved until it touches."""
         for _ in range(100):
-            strain = self.march(50, drag=0.1, cohesion=COHESION, reach=REACH)
+            strain = self.march(50, drag=DRAG, cohesion=COHESION, reach=REACH)
             if strain.speed < 1e-5:
                 break
         for _ in range(len(self.r)):

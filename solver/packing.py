@@ -3,8 +3,10 @@
 Both begin with *cohesive settling*: particles fall one by one at random places and stay where they first touch, which
 makes a connected, very loose pile (solid fraction near 0.15 in 3-D, 0.36 in 2-D).
 
-pour     Gravity pulls the pile down, with damping and friction, until it is at rest; the container is open above.
-density  A lid presses the pile down to the height of the container, slowly and without friction; then weak cohesion
+pour     The pile is gathered below random close packing; then gravity pulls it down, with damping and friction, until
+         it is at rest; the container is open above.
+density  A lid presses the pile down to the height of the container, in a thick medium, so that nothing gets shaken
+         into order (athermal, as in O'Hern et al. 2003), and without friction; then weak cohesion
          draws neighbours together, and clusters that still float are moved until they touch. How many particles that
          takes is found by trying: from the fraction that trials reach in the measured box follows the count of the
          next. With `exchange`, shaken particles may also swap radii, which packs a wide spread denser than random
@@ -14,7 +16,8 @@ A trial depends on the request and its number alone; everything is serial, so a 
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -35,11 +38,15 @@ SAMPLE = 10_000  # particles from which the mean volume is known before they are
 
 @dataclass(frozen=True)
 class Request:
-    """What decides a packing: the table of the case, and the box in which a density is measured (None: all)."""
+    """What decides a packing: the table of the case, and the box in which a density is measured (None: all).
+
+    pause decides nothing: it is called again and again while particles are packed, and may raise to end that.
+    """
 
     particles: Particles
     container: Box
     box: Box | None
+    pause: Callable[[], None] = field(default=lambda: None, compare=False)
 
     @property
     def size(self) -> Floats:
@@ -76,7 +83,7 @@ class Packing:
     realised: dict[str, Any]
 
 
-def request(case: Case) -> Request:
+def request(case: Case, pause: Callable[[], None] = lambda: None) -> Request:
     """The packing that a case asks for. The vacancy box counts where it decides the packing and is in the container."""
     given = case.particles
     if given.source != "packing" or given.container is None:
@@ -86,7 +93,7 @@ def request(case: Case) -> Request:
     outside = (np.array(case.output.vacancy_box[0]) < low).any() or (np.array(case.output.vacancy_box[1]) > high).any()
     if given.method == "pour" or given.packing_density is None or outside:
         box = None
-    return Request(given, given.container, box)
+    return Request(given, given.container, box, pause)
 
 
 def make(wanted: Request) -> Packing:
@@ -122,7 +129,7 @@ def _start(wanted: Request, count: int, trial: int) -> tuple[Heap, float]:
     rng = np.random.default_rng([wanted.particles.seed or 0, trial])
     radii = wanted.radii(count, rng)
     unit = float(radii.mean())
-    return Heap(radii / unit, wanted.size / unit, rng), unit
+    return Heap(radii / unit, wanted.size / unit, rng, wanted.pause), unit
 
 
 def _finish(wanted: Request, heap: Heap, unit: float, trial: int) -> Packing | None:
@@ -164,12 +171,17 @@ class Trials:
         self.ratios: list[float] = []
         self.fractions: list[float] = []
         self.jams: list[float] = []  # counts with which heaps would have jammed at the height of the container
-        self.floor = 1  # below this count the pile does not reach the lid
+        self.shorts: list[float] = []  # counts with which piles that were too low would have reached the lid
 
     def reached(self, fraction: float, count: int) -> None:
         """A packing with this fraction was made."""
         self.fractions.append(fraction)
         self.ratios.append(fraction / (count * self.per_particle))
+
+    @property
+    def floor(self) -> int:
+        """Count whose pile reaches the lid every other time: one that was too low does not rule out its count."""
+        return max(1, round(0.97 * float(np.mean(self.shorts)))) if self.shorts else 1
 
     @property
     def ceiling(self) -> float:
@@ -237,7 +249,7 @@ def _trial(wanted: Request, count: int, trial: int, seen: Trials) -> Packing | N
     heap, unit = _start(wanted, count, trial)
     height, pile = float(wanted.size[-1]) / unit, heap.top
     if pile < height:
-        seen.floor = max(seen.floor, math.ceil(count * height / pile))
+        seen.shorts.append(count * height / pile)
         return None
     exchange = bool(wanted.particles.exchange)
     if not (heap.anneal(height, ROUNDS) if exchange else heap.press(height)):

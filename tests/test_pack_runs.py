@@ -1,6 +1,7 @@
 """Packings in runs and on disk: the cache, `frit pack`, what a run directory keeps, resuming."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from launching import TIMEOUT, different, history, interrupted, record, resume, solve
+from launching import TIMEOUT, different, history, interrupted, launch, record, resume, solve
 
+from frit.service.launch import is_open_mpi, mpirun_command
 from frit.solver import pack_store, particle_file
 from frit.solver.case import parse_case
 from frit.solver.packing import Packing, request
@@ -94,6 +96,39 @@ def test_a_run_goes_on_with_the_particles_it_has(tmp_path: Path) -> None:
     assert different(whole, resumed, 1e-10) == {}
     assert record(resumed)["packing"] == before
     assert record(resumed)["resumed"]
+
+
+# The solver packs and packs: each trial is found wanting, and the first one tells that it was made.
+PACKING = """
+import sys
+from pathlib import Path
+from frit.solver import __main__ as solver, pack_store
+from frit.solver.packing import make
+
+def pack(wanted):
+    while True:
+        make(wanted)
+        Path(sys.argv[sys.argv.index("--out") + 1], "packing").touch()
+
+pack_store.make = pack
+sys.exit(solver.main())
+"""
+
+
+@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGTERM), (1, signal.SIGINT), (2, signal.SIGTERM)])
+def test_a_signal_ends_the_packing(tmp_path: Path, ranks: int, number: signal.Signals) -> None:
+    """Status 130 and a state; nothing to resume, but the directory can be run in again."""
+    directory, case = tmp_path / "run", changed(seed=130)  # no other test's: never in the cache
+    with launch(case, directory, ranks, PACKING) as tree:
+        tree.until(lambda: (directory / "packing").exists())
+        tree.process.send_signal(number)
+        status, printed = tree.ended()
+        assert tree.gone()
+    assert record(directory)["state"] == "interrupted", printed
+    assert "while the particles were packed" in record(directory)["message"]
+    assert status == 130 or is_open_mpi(mpirun_command(1, [])[0]), printed
+    assert not (directory / "particles.csv").exists()
+    solve(PACK, directory)
 
 
 def test_frit_pack_writes_particles_and_a_picture_and_tells_about_them(tmp_path: Path) -> None:

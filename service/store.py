@@ -153,15 +153,42 @@ class _Work:
 
 
 @dataclass(frozen=True)
-class _Submission:
-    """Work that is done for many at once: a job to be queued."""
+class _Share:
+    """Work that is done for many at once: `effect` takes all that have it, and answers each; an error is one's own."""
 
-    job: NewJob
-    key: Key | None
+    effect: Callable[[Transaction, Sequence[Any]], Sequence[Any]]
+    wanted: Any
     answer: Future[Any]
 
 
-_Piece = tuple[Sequence[_Work | _Submission], Callable[[Transaction], Sequence[Any]]]
+_Piece = tuple[Sequence[_Work | _Share], Callable[[Transaction], Sequence[Any]]]
+
+
+@dataclass(frozen=True)
+class _Submission:
+    """A job to be queued."""
+
+    job: NewJob
+    key: Key | None
+
+
+@dataclass(frozen=True)
+class _Start:
+    """An attempt whose runner has recorded itself."""
+
+    job: str
+    attempt: int
+    process: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _End:
+    """An attempt that has ended."""
+
+    job: str
+    end: Exit
+    attempts_limit: int
+    result: Mapping[str, Any] | None
 
 
 class Store:
@@ -182,7 +209,7 @@ class Store:
                 self._writer.connect().close()  # the log must be there before the first reader is
             except DBAPIError as error:
                 raise StoreError(f"{self.path}: {_words(error)}") from error
-        self._waiting: queue.SimpleQueue[_Work | _Submission | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[_Work | _Share | None] = queue.SimpleQueue()
         self._door = threading.Lock()
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
@@ -207,7 +234,7 @@ class Store:
         """Have the effect done in a transaction; the future is done when it is durable."""
         return self._put(_Work(effect, Future()))
 
-    def _put(self, work: "_Work | _Submission") -> "Future[Any]":
+    def _put(self, work: "_Work | _Share") -> "Future[Any]":
         with self._door:
             if self._closed:
                 raise StoreError(f"{self.path}: closed, or opened for reading only")
@@ -216,16 +243,16 @@ class Store:
 
     def _write(self) -> None:
         while (work := self._waiting.get()) is not None:
-            batch: list[_Work | _Submission | None] = [work]
+            batch: list[_Work | _Share | None] = [work]
             while len(batch) < BATCH and not self._waiting.empty():
                 batch.append(self._waiting.get())
             self._commit([work for work in batch if work is not None])
             if batch[-1] is None:
                 return
 
-    def _commit(self, batch: Sequence[_Work | _Submission]) -> None:
+    def _commit(self, batch: Sequence[_Work | _Share]) -> None:
         batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
-        answers: list[tuple[_Work | _Submission, Any]] = []
+        answers: list[tuple[_Work | _Share, Any]] = []
         done: list[Transaction] = []
         pieces = _pieces(batch)
         try:
@@ -305,7 +332,7 @@ class Store:
 
     def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
-        return self._put(_Submission(job, key, Future()))
+        return self._put(_Share(_submit, _Submission(job, key), Future()))
 
     def submit_sweep(
         self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
@@ -337,55 +364,32 @@ class Store:
         """Give queued jobs (by seq) their cores. One that is not queued any more is left out."""
 
         def effect(t: Transaction) -> list[Job]:
-            cores, now, claimed, rows = dict(choices), time.time(), list[Job](), list[dict[str, Any]]()
+            cores, now, rows, moves = dict(choices), time.time(), list[dict[str, Any]](), _Moves(t)
             chosen = sa.select(jobs).where(jobs.c.seq.in_(cores), jobs.c.state == State.QUEUED)
             for job in map(_record, t.run(chosen).all()):
                 number, started = job.attempt + 1, job.started or now
-                claimed.append(_move(t, job, Move.CLAIM, None, attempt=number, started=started, ended=None))
+                moves.add(job, Move.CLAIM, None, attempt=number, started=started, ended=None)
                 rows.append({"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now})
                 t.note("attempt", **rows[-1])
             if rows:
                 t.run(attempts.insert(), rows)
-            return claimed
+            return moves.made()
 
         return self.write(effect)
 
     def start(self, identifier: str, attempt: int, pid: int, pid_start: int, boot: str) -> "Future[Job]":
         """The runner of an attempt has recorded itself. Told twice it counts once."""
+        process = {"pid": pid, "pid_start": pid_start, "boot": boot}
+        return self._put(_Share(_start, _Start(identifier, attempt, process), Future()))
 
-        def effect(t: Transaction) -> Job:
-            job = _job(t.connection, identifier)
-            if (job.attempt, job.state) != (attempt, State.STARTING):
-                return job
-            _set_attempt(t, job, pid=pid, pid_start=pid_start, boot=boot)
-            return _move(t, job, Move.START, None)
+    def finish(
+        self, identifier: str, end: Exit, attempts_limit: int, result: Mapping[str, Any] | None = None
+    ) -> "Future[Job]":
+        """An attempt has ended. Told twice, or of an attempt that is not the present one, it counts once.
 
-        return self.write(effect)
-
-    def finish(self, identifier: str, end: Exit, attempts_limit: int) -> "Future[Job]":
-        """An attempt has ended. Told twice, or of an attempt that is not the present one, it counts once."""
-
-        def effect(t: Transaction) -> Job:
-            job = _job(t.connection, identifier)
-            if job.attempt != end.attempt or not job.state.active:
-                return job
-            broke = end.move in (Move.BREAK, Move.LOSE)
-            move = end.move
-            if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
-                broke, move = False, Move.STOP
-            state = after(job.state, move)
-            _set_attempt(
-                t, job, ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
-            )  # fmt: skip
-            failures = job.failures + 1 if broke else 0
-            return _move(
-                t, job, move, end.message, failures=failures, retrying=broke and failures < attempts_limit,
-                stopping=False,
-                ended=None if state is State.QUEUED else end.ended,
-                core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
-            )  # fmt: skip
-
-        return self.write(effect)
+        result: the scalars by which the job is found from now on; None: those it has.
+        """
+        return self._put(_Share(_finish, _End(identifier, end, attempts_limit, result), Future()))
 
     def requeue(self, identifier: str, attempt: int) -> "Future[Job]":
         """The pause after a broken attempt is over."""
@@ -462,10 +466,7 @@ class Store:
     def set_result(self, seq: int, result: Mapping[str, Any]) -> "Future[None]":
         """The scalars by which finished jobs are found."""
 
-        def effect(t: Transaction) -> None:
-            t.run(jobs.update().where(jobs.c.seq == seq).values(result=dict(result)))
-
-        return self.write(effect)
+        return self.write(lambda t: _set_results(t, {seq: result}))
 
     # --- looking ------------------------------------------------------------------------------------------
 
@@ -505,11 +506,9 @@ class Store:
     def queued(self, limit: int) -> list[tuple[int, int]]:
         """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
         query = (
-            sa.select(jobs.c.seq, jobs.c.ranks).where(jobs.c.state == State.QUEUED)
-            .order_by(jobs.c.priority.desc(), jobs.c.seq).limit(limit)
-        )  # fmt: skip
-        with self.reading() as connection:
-            return [(row.seq, row.ranks) for row in connection.execute(query)]
+            "SELECT seq, ranks FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
+        )
+        return self._ask(query, (State.QUEUED, limit))
 
     def unfinished(self) -> tuple[list[tuple[Job, Attempt]], list[Job]]:
         """Jobs that have cores with their present attempt, and jobs that wait for another attempt."""
@@ -637,17 +636,19 @@ class Store:
     # --- tokens -------------------------------------------------------------------------------------------
 
     def active_tokens(self) -> dict[str, Token]:
-        """The tokens that count now, by hash. Asked at every request: no layer between it and SQLite."""
+        """The tokens that count now, by hash."""
+        rows = self._ask("SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL")
+        return {hashed: Token(name, scope, created, None) for hashed, name, scope, created in rows}
+
+    def _ask(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
+        """What is asked all the time: no layer between it and SQLite."""
         try:
             connection = self._reader.raw_connection()
             try:
-                rows = connection.cursor().execute(
-                    "SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL"
-                )
-                return {hashed: Token(name, scope, created, None) for hashed, name, scope, created in rows}
+                return connection.cursor().execute(query, values).fetchall()
             finally:
                 connection.close()
-        except (DBAPIError, sqlite3.Error) as error:
+        except (DBAPIError, sqlite3.Error, sa.exc.TimeoutError) as error:
             raise StoreError(f"{self.path}: {error}") from error
 
 
@@ -748,16 +749,109 @@ def _move(t: Transaction, job: Job, move: Move, message: str | None, **values: A
     return replace(job, state=state, message=message, **values)
 
 
+class _Moves:
+    """Many jobs' moves in a few statements; all set the same columns. A job may come again: it is as it was left."""
+
+    def __init__(self, t: Transaction) -> None:
+        self.transaction, self.now = t, time.time()
+        self.jobs: list[Job] = []
+        self.changes: list[dict[str, Any]] = []
+
+    def add(self, job: Job, move: Move, message: str | None, **values: Any) -> Job:
+        """As `_move` does; to be written by `made`."""
+        change = {"state": after(job.state, move), "message": message, **values}
+        self.changes.append({"which": job.seq, **change})
+        self.transaction.note("set", job=job.seq, event=self.now, values=change)
+        self.jobs.append(replace(job, **change))
+        return self.jobs[-1]
+
+    def made(self) -> list[Job]:
+        """Write them; the jobs as they are now."""
+        if self.jobs:
+            self.transaction.run(CHANGE_JOBS, self.changes)
+            told = [{"job": j.seq, "at": self.now, "state": j.state, "message": j.message} for j in self.jobs]
+            self.transaction.run(TELL, told)
+        return self.jobs
+
+
+TELL = events.insert()
+CHANGE_JOBS = jobs.update().where(jobs.c.seq == sa.bindparam("which"))
+CHANGE_ATTEMPTS = attempts.update().where(
+    attempts.c.job == sa.bindparam("which"), attempts.c.number == sa.bindparam("try")
+)
+
+
+def _start(t: Transaction, wanted: Sequence[_Start]) -> list[Job | NotFoundError]:
+    known, moves, rows = _known_jobs(t, [start.job for start in wanted]), _Moves(t), list[dict[str, Any]]()
+    for start in wanted:
+        job = known[start.job]
+        if isinstance(job, Job) and (job.attempt, job.state) == (start.attempt, State.STARTING):
+            rows.append(_of_attempt(t, job, start.process))
+            known[start.job] = moves.add(job, Move.START, None)
+    return _moved(t, rows, moves, [known[start.job] for start in wanted])
+
+
+def _finish(t: Transaction, wanted: Sequence[_End]) -> list[Job | NotFoundError]:
+    known, moves, rows = _known_jobs(t, [each.job for each in wanted]), _Moves(t), list[dict[str, Any]]()
+    results: dict[int, Mapping[str, Any]] = {}
+    for each in wanted:
+        job, end = known[each.job], each.end
+        if not isinstance(job, Job) or job.attempt != end.attempt or not job.state.active:
+            continue
+        broke, move = end.move in (Move.BREAK, Move.LOSE), end.move
+        if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
+            broke, move = False, Move.STOP
+        state, failures = after(job.state, move), job.failures + 1 if broke else 0
+        ended = {"ended": end.ended, "state": state, "message": end.message, "core_seconds": end.core_seconds}
+        rows.append(_of_attempt(t, job, ended))
+        if each.result is not None:
+            results[job.seq] = each.result
+        known[each.job] = moves.add(
+            job, move, end.message, failures=failures, retrying=broke and failures < each.attempts_limit,
+            stopping=False, ended=None if state is State.QUEUED else end.ended,
+            core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
+        )  # fmt: skip
+    _set_results(t, results)
+    return _moved(t, rows, moves, [known[each.job] for each in wanted])
+
+
+def _moved(
+    t: Transaction, rows: Sequence[Mapping[str, Any]], moves: _Moves, answers: "list[Job | NotFoundError]"
+) -> "list[Job | NotFoundError]":
+    if rows:
+        t.run(CHANGE_ATTEMPTS, rows)
+    moves.made()
+    return answers
+
+
+def _of_attempt(t: Transaction, job: Job, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The change of a job's present attempt, for `CHANGE_ATTEMPTS`."""
+    t.note("attempt", job=job.seq, number=job.attempt, **values)
+    return {"which": job.seq, "try": job.attempt, **values}
+
+
+def _set_results(t: Transaction, results: Mapping[int, Mapping[str, Any]]) -> None:
+    if results:
+        t.run(CHANGE_JOBS, [{"which": seq, "result": dict(result)} for seq, result in results.items()])
+
+
+def _known_jobs(t: Transaction, identifiers: Sequence[str]) -> "dict[str, Job | NotFoundError]":
+    """The job of each id or beginning of one."""
+    rows = t.run(sa.select(jobs).where(jobs.c.id.in_(identifiers)))
+    known: dict[str, Job | NotFoundError] = {job.id: job for job in map(_record, rows)}
+    for identifier in identifiers:
+        if identifier not in known:
+            try:
+                known[identifier] = _job(t.connection, identifier)
+            except NotFoundError as error:
+                known[identifier] = error
+    return known
+
+
 def _set(t: Transaction, job: Job, event: float | None = None, **values: Any) -> None:
     """Change columns of a job; `event`: when that made an event."""
     t.run(jobs.update().where(jobs.c.seq == job.seq).values(values))
     t.note("set", job=job.seq, event=event, values=values)
-
-
-def _set_attempt(t: Transaction, job: Job, **values: Any) -> None:
-    """Change columns of a job's present attempt."""
-    t.run(attempts.update().where(attempts.c.job == job.seq, attempts.c.number == job.attempt).values(values))
-    t.note("attempt", job=job.seq, number=job.attempt, **values)
 
 
 def _retry(t: Transaction, job: Job) -> Job:
@@ -804,11 +898,18 @@ def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReus
     ]  # fmt: skip
 
 
-def _pieces(batch: "Sequence[_Work | _Submission]") -> "list[_Piece]":
-    """What is done in a savepoint each: all submissions at once, everything else by itself."""
-    submissions = [work for work in batch if isinstance(work, _Submission)]
-    pieces: list[_Piece] = [([work], _alone(work)) for work in batch if isinstance(work, _Work)]
-    return [(submissions, lambda t: _submit(t, submissions)), *pieces] if submissions else pieces
+def _pieces(batch: "Sequence[_Work | _Share]") -> "list[_Piece]":
+    """What is done in a savepoint each: first all that is done for many at once, then everything else by itself."""
+    shares: dict[Any, list[_Share]] = {}
+    for work in batch:
+        if isinstance(work, _Share):
+            shares.setdefault(work.effect, []).append(work)
+    together: list[_Piece] = [(share, _shared(share)) for share in shares.values()]
+    return together + [([work], _alone(work)) for work in batch if isinstance(work, _Work)]
+
+
+def _shared(share: Sequence[_Share]) -> "Callable[[Transaction], Sequence[Any]]":
+    return lambda t: share[0].effect(t, [work.wanted for work in share])
 
 
 def _alone(work: _Work) -> "Callable[[Transaction], list[Any]]":

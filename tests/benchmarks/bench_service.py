@@ -151,7 +151,7 @@ STAND_IN = """#!/bin/sh
 [ "$1" = --version ] && exit
 for word; do [ "$before" = --out ] && break; before=$word; done
 %s
-printf '{"state": "done"}' > "$word/run.new" && mv "$word/run.new" "$word/run.json"
+printf '{"state": "done"}' > "$word/run.json"
 """
 
 

@@ -5,8 +5,10 @@ runner does nothing else.
 """
 
 import os
+import select
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NoReturn
 
@@ -14,7 +16,7 @@ UNHEARD = 127  # exit status where the program cannot be executed
 
 
 class Child:
-    """A program from its start on. `words`: what it and its own children say, until none of them holds the pipe."""
+    """A program from its start on, and what it and its own children say until none of them holds the pipe."""
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str], first: Callable[[], None] | None = None
@@ -26,11 +28,35 @@ class Child:
         if self.pid == 0:
             become(command, environment, write, first)
         os.close(write)
-        self._process = os.pidfd_open(self.pid)
-        self.words = open(read, encoding="utf-8", errors="replace")  # noqa: SIM115 - closed with the child
+        self._process, self._words, self._rest = os.pidfd_open(self.pid), read, b""
+        self._open = True  # whether anybody holds the pipe
+        self._said: deque[str] = deque()  # and not yet passed on
+
+    def lines(self, ended: Callable[[], None]) -> Iterator[str]:
+        """What is said, until it has ended and nobody holds the pipe; `ended` is called once it has ended."""
+        happened = select.poll()
+        if self.returncode is None:
+            happened.register(self._process, select.POLLIN)
+        if self._open:
+            happened.register(self._words, select.POLLIN)
+        while self._said or self.returncode is None or self._open:
+            if self._said:
+                yield self._said.popleft()
+                continue
+            ready = [handle for handle, _ in happened.poll()]
+            if self._words in ready:
+                if not (data := os.read(self._words, 65_536)):
+                    self._open = False
+                    happened.unregister(self._words)
+                *whole, self._rest = (self._rest + data).split(b"\n")
+                self._said.extend(line.decode(errors="replace") for line in (whole if data else [self._rest]))
+            elif self._process in ready:
+                happened.unregister(self._process)
+                self.wait()
+                ended()
 
     def wait(self) -> int:
-        """Until it has ended; by one thread only."""
+        """Its exit status once it has ended; by one thread only."""
         if self.returncode is None:
             self.returncode = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         return self.returncode
@@ -42,7 +68,7 @@ class Child:
 
     def close(self) -> None:
         """Once it has ended."""
-        self.words.close()
+        os.close(self._words)
         os.close(self._process)
 
 

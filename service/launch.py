@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -117,15 +116,13 @@ class Launch:
         command = mpirun_command(ranks, arguments)
         environment = (OPEN_MPI if is_open_mpi(command[0]) else {}) | clean_environment(os.environ)
         # mpich gives each rank a session of its own: only a mark finds those whose mpirun is gone.
-        environment |= {"FRIT_LAUNCH": uuid.uuid4().hex, **(marks or {})}
+        environment |= {"FRIT_LAUNCH": os.urandom(16).hex(), **(marks or {})}
         self._mark = f"FRIT_LAUNCH={environment['FRIT_LAUNCH']}"
         self.directory, self.stopping, self._adopts = directory, False, adopts
         self._spoken: deque[str] = deque(maxlen=40)
         directory.mkdir(parents=True, exist_ok=True)
         self._record_before = stamp(directory / "run.json")
         self._process = Child(command, environment, first)
-        self._reaper = threading.Thread(target=self._reap, daemon=True)
-        self._reaper.start()
 
     def __enter__(self) -> Self:
         return self
@@ -133,12 +130,13 @@ class Launch:
     def __exit__(self, *_: object) -> None:
         if self.alive:
             self.kill()
-        self._reaper.join()
+            self._process.wait()
+            self._sweep_up()
         self._process.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """Progress as rank 0 prints it, until mpirun ends; what else is said is kept for the Outcome."""
-        for line in self._process.words:
+        for line in self._process.lines(self._sweep_up):
             progress = None
             with suppress(json.JSONDecodeError):
                 progress = json.loads(line)
@@ -174,7 +172,6 @@ class Launch:
         """What run.json says, if it was written since the start, once the whole tree is gone."""
         for _ in self:
             pass
-        self._reaper.join()
         record, code, spoken = read_record(self.directory), self._process.wait(), "\n".join(self._spoken)
         fresh = stamp(self.directory / "run.json") != self._record_before
         if fresh and record.get("state") in ENDS:
@@ -188,9 +185,8 @@ class Launch:
         message = f"mpirun ended with status {code} and no word of the solver"
         return Outcome("failed", message, code, spoken, retry=True)
 
-    def _reap(self) -> None:
+    def _sweep_up(self) -> None:
         """mpirun's end is the end of all: no orphan stays."""
-        self._process.wait()
         for _ in range(100):
             if (self._adopts and childless()) or not self.kill():
                 break

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -141,9 +142,41 @@ class Transaction:
         """Execute; `rows` for many at once."""
         return cast("sa.CursorResult[Any]", self.connection.execute(statement, rows))
 
+    def ask(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """What is asked all the time: no layer between it and SQLite."""
+        found: list[tuple[Any, ...]] = self.raw.execute(query, values).fetchall()
+        return found
+
+    def add(self, table: sa.Table, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Insert rows that all have the same columns, as SQLite keeps them."""
+        if rows:
+            self.raw.executemany(_addition(table.name, tuple(rows[0])), rows)
+
+    def change(self, table: sa.Table, which: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+        """Change the rows that have these values in the columns `which`; all change the same other columns."""
+        if rows:
+            self.raw.executemany(_change(table.name, tuple(rows[0]), tuple(which)), rows)
+
+    @property
+    def raw(self) -> sqlite3.Connection:
+        """SQLite's own connection."""
+        return cast("sqlite3.Connection", self.connection.connection.dbapi_connection)
+
     def note(self, kind: str, **line: Any) -> None:
         """A line of the journal: what a lost index is rebuilt from."""
         self.lines.append(json.dumps({"kind": kind, **line}) + "\n")
+
+
+@lru_cache
+def _addition(table: str, columns: tuple[str, ...]) -> str:
+    names, values = ", ".join(f'"{name}"' for name in columns), ", ".join(f":{name}" for name in columns)
+    return f"INSERT INTO {table} ({names}) VALUES ({values})"
+
+
+@lru_cache
+def _change(table: str, columns: tuple[str, ...], which: tuple[str, ...]) -> str:
+    changed = ", ".join(f'"{name}" = :{name}' for name in columns if name not in which)
+    return f"UPDATE {table} SET {changed} WHERE {' AND '.join(f'{name} = :{name}' for name in which)}"
 
 
 @dataclass
@@ -261,7 +294,7 @@ class Store:
                     works, effect = pieces.pop(0)
                     transaction = Transaction(connection)
                     try:
-                        with connection.begin_nested():
+                        with _savepoint(transaction.raw):
                             results = effect(transaction)
                         answers += zip(works, results, strict=True)
                         done.append(transaction)
@@ -365,14 +398,14 @@ class Store:
 
         def effect(t: Transaction) -> list[Job]:
             cores, now, rows, moves = dict(choices), time.time(), list[dict[str, Any]](), _Moves(t)
-            chosen = sa.select(jobs).where(jobs.c.seq.in_(cores), jobs.c.state == State.QUEUED)
-            for job in map(_record, t.run(chosen).all()):
-                number, started = job.attempt + 1, job.started or now
-                moves.add(job, Move.CLAIM, None, attempt=number, started=started, ended=None)
-                rows.append({"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now})
-                t.note("attempt", **rows[-1])
-            if rows:
-                t.run(attempts.insert(), rows)
+            for job in _all_with(t, "seq", list(cores)):
+                if job.state is State.QUEUED:
+                    number, started = job.attempt + 1, job.started or now
+                    moves.add(job, Move.CLAIM, None, attempt=number, started=started, ended=None)
+                    row = {"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now}
+                    t.note("attempt", **row)
+                    rows.append({**row, "cores": _compact(row["cores"])})
+            t.add(attempts, rows)
             return moves.made()
 
         return self.write(effect)
@@ -677,6 +710,20 @@ def _engine(path: Path, writer: bool) -> Engine:
     return engine
 
 
+@contextmanager
+def _savepoint(connection: sqlite3.Connection) -> Iterator[None]:
+    """What the block did is undone where it ends badly, as far as there is a transaction left."""
+    connection.execute("SAVEPOINT piece")
+    try:
+        yield
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK TO piece")
+            connection.execute("RELEASE piece")
+        raise
+    connection.execute("RELEASE piece")
+
+
 def _compact(tree: Any) -> str:
     return json.dumps(tree, separators=(",", ":"), allow_nan=False)
 
@@ -715,6 +762,19 @@ def _record(row: Row[Any]) -> Job:
         created=values["created"], started=values["started"], ended=values["ended"],
         core_seconds=values["core_seconds"], result=values["result"], case=values["case"],
     )  # fmt: skip
+
+
+def _all_with(t: Transaction, column: str, values: Sequence[Any]) -> list[Job]:
+    """Jobs that have one of the values in the column; SQLite takes some thousands of them."""
+    query = f"SELECT {COLUMNS} FROM jobs WHERE {column} IN ({', '.join('?' * len(values))})"
+    return [
+        Job(*row[:4], State(row[4]), *row[5:8], tuple(json.loads(row[8])), *row[9:12], bool(row[12]), bool(row[13]),
+            *row[14:18], json.loads(row[18]), row[19])
+        for row in t.ask(query, values)
+    ]  # fmt: skip
+
+
+COLUMNS = ", ".join(f'"{column.name}"' for column in jobs.c)  # in the order of `Job`'s fields
 
 
 def _by_seq(connection: Connection, seq: int) -> Job:
@@ -760,25 +820,17 @@ class _Moves:
     def add(self, job: Job, move: Move, message: str | None, **values: Any) -> Job:
         """As `_move` does; to be written by `made`."""
         change = {"state": after(job.state, move), "message": message, **values}
-        self.changes.append({"which": job.seq, **change})
+        self.changes.append({"seq": job.seq, **change})
         self.transaction.note("set", job=job.seq, event=self.now, values=change)
         self.jobs.append(replace(job, **change))
         return self.jobs[-1]
 
     def made(self) -> list[Job]:
         """Write them; the jobs as they are now."""
-        if self.jobs:
-            self.transaction.run(CHANGE_JOBS, self.changes)
-            told = [{"job": j.seq, "at": self.now, "state": j.state, "message": j.message} for j in self.jobs]
-            self.transaction.run(TELL, told)
+        self.transaction.change(jobs, ["seq"], self.changes)
+        told = [{"job": j.seq, "at": self.now, "state": j.state, "message": j.message} for j in self.jobs]
+        self.transaction.add(events, told)
         return self.jobs
-
-
-TELL = events.insert()
-CHANGE_JOBS = jobs.update().where(jobs.c.seq == sa.bindparam("which"))
-CHANGE_ATTEMPTS = attempts.update().where(
-    attempts.c.job == sa.bindparam("which"), attempts.c.number == sa.bindparam("try")
-)
 
 
 def _start(t: Transaction, wanted: Sequence[_Start]) -> list[Job | NotFoundError]:
@@ -818,27 +870,25 @@ def _finish(t: Transaction, wanted: Sequence[_End]) -> list[Job | NotFoundError]
 def _moved(
     t: Transaction, rows: Sequence[Mapping[str, Any]], moves: _Moves, answers: "list[Job | NotFoundError]"
 ) -> "list[Job | NotFoundError]":
-    if rows:
-        t.run(CHANGE_ATTEMPTS, rows)
+    t.change(attempts, ["job", "number"], rows)
     moves.made()
     return answers
 
 
 def _of_attempt(t: Transaction, job: Job, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The change of a job's present attempt, for `CHANGE_ATTEMPTS`."""
-    t.note("attempt", job=job.seq, number=job.attempt, **values)
-    return {"which": job.seq, "try": job.attempt, **values}
+    """The change of a job's present attempt."""
+    row = {"job": job.seq, "number": job.attempt, **values}
+    t.note("attempt", **row)
+    return row
 
 
 def _set_results(t: Transaction, results: Mapping[int, Mapping[str, Any]]) -> None:
-    if results:
-        t.run(CHANGE_JOBS, [{"which": seq, "result": dict(result)} for seq, result in results.items()])
+    t.change(jobs, ["seq"], [{"seq": seq, "result": _compact(result)} for seq, result in results.items()])
 
 
 def _known_jobs(t: Transaction, identifiers: Sequence[str]) -> "dict[str, Job | NotFoundError]":
     """The job of each id or beginning of one."""
-    rows = t.run(sa.select(jobs).where(jobs.c.id.in_(identifiers)))
-    known: dict[str, Job | NotFoundError] = {job.id: job for job in map(_record, rows)}
+    known: dict[str, Job | NotFoundError] = {job.id: job for job in _all_with(t, "id", identifiers)}
     for identifier in identifiers:
         if identifier not in known:
             try:
@@ -863,10 +913,10 @@ def _retry(t: Transaction, job: Job) -> Job:
 def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReusedError]:
     """Queue all that no key has brought before: a few statements, however many there are."""
     texts = {f"{key.scope} {key.value}" for submission in wanted if (key := submission.key) is not None}
-    query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
     # by key: the fingerprint of its request, and the job's id or its place among the new ones
     seen: dict[str, tuple[str, str | int]] = {}
     if texts:
+        query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
         seen = {row.key: (row.fingerprint, row.resource) for row in t.run(query)}
     new: list[NewJob] = []
     places: list[str | int | KeyReusedError] = []
@@ -923,37 +973,36 @@ def _reused(key: Key) -> KeyReusedError:
 def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
     """Queue jobs. The id is the beginning of the identity, with a number where a case comes again."""
     now, made = time.time(), list[dict[str, Any]]()
-    base = _existing_ids(t.connection, [job.identity for job in new])
+    base = _existing_ids(t, [job.identity for job in new])
     for job in new:
         base[job.identity] = again = base.get(job.identity, 0) + 1
         made.append(
             {"id": job.identity[:16] + (f"-{again}" if again > 1 else ""), "name": job.name, "identity": job.identity,
-             "state": State.QUEUED, "priority": job.priority, "ranks": job.ranks, "tags": list(job.tags),
+             "state": State.QUEUED.value, "priority": job.priority, "ranks": job.ranks, "tags": job.tags,
              "time_limit": job.time_limit, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
              "created": now, "result": {}, "case": job.case}
         )  # fmt: skip
     if not made:
         return []
-    t.run(jobs.insert(), made)
-    last = t.run(sa.select(sa.func.max(jobs.c.seq))).scalar_one()
+    t.add(jobs, [{**row, "tags": _compact(row["tags"]), "result": "{}"} for row in made])
+    [(last,)] = t.ask("SELECT max(seq) FROM jobs")
     numbers = range(last - len(made) + 1, last + 1)
-    t.run(events.insert(), [{"job": seq, "at": now, "state": State.QUEUED} for seq in numbers])
+    t.add(events, [{"job": seq, "at": now, "state": "queued"} for seq in numbers])
     for seq, row in zip(numbers, made, strict=True):
         t.note("job", seq=seq, **row)
     t.durable = True
-    empty = {"message": None, "started": None, "ended": None, "core_seconds": None}
-    return [
-        Job(**{**row, **empty, "seq": seq, "tags": tuple(row["tags"])})
-        for seq, row in zip(numbers, made, strict=True)
-    ]
+    empty = {"message": None, "started": None, "ended": None, "core_seconds": None, "state": State.QUEUED}
+    return [Job(**{**row, **empty, "seq": seq}) for seq, row in zip(numbers, made, strict=True)]
 
 
-def _existing_ids(connection: Connection, which: Sequence[str]) -> dict[str, int]:
+def _existing_ids(t: Transaction, which: Sequence[str]) -> dict[str, int]:
     """How many jobs each identity has had."""
     found: dict[str, int] = {}
     for k in range(0, len(which), 500):
-        part = sa.select(jobs.c.identity, sa.func.count()).where(jobs.c.identity.in_(which[k : k + 500]))
-        found |= {identity: n for identity, n in connection.execute(part.group_by(jobs.c.identity))}
+        part = which[k : k + 500]
+        marks = ", ".join("?" * len(part))
+        query = f"SELECT identity, count(*) FROM jobs WHERE identity IN ({marks}) GROUP BY identity"
+        found |= dict(t.ask(query, part))
     return found
 
 

@@ -29,6 +29,7 @@ from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
+ASKED = 16  # indices that questions have made, at most
 FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
 SUCCEEDED = 1 << 60  # more than any seq
@@ -244,6 +245,9 @@ class Store:
                 raise StoreError(f"{self.path}: {_words(error)}") from error
         self._waiting: queue.SimpleQueue[_Work | _Share | None] = queue.SimpleQueue()
         self._door = threading.Lock()
+        self._asking = threading.RLock()
+        made = self._ask("SELECT name FROM sqlite_master WHERE type = 'index' AND name GLOB 'asked_*'")
+        self._asked = {name.removeprefix("asked_"): True for (name,) in made}  # the last one asked for last; whether made
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
         self._closed = not writable
@@ -381,11 +385,10 @@ class Store:
             members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
             t.note("sweep", **row, points=members)
             rows = [
-                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": parameters}
+                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": _compact(parameters)}
                 for i, (job, label, parameters) in enumerate(members)
             ]
-            if rows:
-                t.run(sweep_jobs.insert(), rows)
+            t.add(sweep_jobs, rows)
             _remember(t, key, identifier)
             return _sweep(t.connection, identifier)
 
@@ -535,6 +538,36 @@ class Store:
             rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
             found = {row.seq: _record(row) for row in rows}
         return [(found[seq], at) for seq, at in places]
+
+    def indexed(self, key: str, expression: str) -> bool:
+        """Whether an index of jobs has what a list is filtered or ordered by.
+
+        If not, one is made, for those who ask again; of too many the one that was not asked for longest goes. Few jobs
+        need none.
+        """
+        with self._asking:
+            made = self._asked.pop(key, None)
+            if made is None:
+                if self._closed or self._ask("SELECT count(*) FROM (SELECT 1 FROM jobs LIMIT ?)", (FEW,))[0][0] < FEW:
+                    return False
+                gone = [name for name, _ in zip(self._asked, range(len(self._asked) + 1 - ASKED), strict=False)]
+                for name in gone:
+                    del self._asked[name]
+                self._asked[key] = False
+                with suppress(StoreError):
+                    self.write(lambda t: _change_indices(t, key, expression, gone)).add_done_callback(
+                        lambda done: self._found(key, done.exception() is None)
+                    )
+            else:
+                self._asked[key] = made
+            return self._asked.get(key, False)
+
+    def _found(self, key: str, made: bool) -> None:
+        with self._asking:
+            if made and key in self._asked:
+                self._asked[key] = True
+            elif not made:
+                self._asked.pop(key, None)
 
     def queued(self, limit: int) -> list[tuple[int, int]]:
         """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
@@ -724,8 +757,7 @@ def _savepoint(connection: sqlite3.Connection) -> Iterator[None]:
     connection.execute("RELEASE piece")
 
 
-def _compact(tree: Any) -> str:
-    return json.dumps(tree, separators=(",", ":"), allow_nan=False)
+_compact = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 
 
 def _spoils_all(connection: Connection, error: Exception) -> bool:
@@ -1055,6 +1087,12 @@ def _sweep(connection: Connection, identifier: str) -> SweepRecord:
     return SweepRecord(
         row.seq, row.id, row.name, row.definition, row.duplicates, row.created, sum(states.values()), states
     )
+
+
+def _change_indices(t: Transaction, key: str, expression: str, gone: Sequence[str]) -> None:
+    for name in gone:
+        t.raw.execute(f'DROP INDEX IF EXISTS "asked_{name}"')
+    t.raw.execute(f'CREATE INDEX IF NOT EXISTS "asked_{key}" ON jobs ({expression})')
 
 
 def _known(t: Transaction, key: Key | None) -> str | None:

@@ -158,7 +158,7 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
             lambda scalar: filters.native(scalar) or store.indexed(scalar.key, filters.sql_of(scalar)),
         )  # fmt: skip
         value = None if selection.scalar is None else selection.scalar.sql
-        found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.indexed)
+        found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.few, selection.near)
         shown = [views.summary(job, hidden(engine)) for job, _ in found[: selection.limit]]
         following = None
         if len(found) > selection.limit:

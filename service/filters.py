@@ -13,6 +13,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
@@ -29,6 +30,7 @@ from .schema import job_tags, jobs, sweep_jobs
 Condition = sa.ColumnElement[bool]
 PAGE = 50  # jobs on a page, unless asked for
 LARGEST_PAGE = 500
+NEAR = 1000  # jobs that are looked at before a range is sorted
 ORDERING = ("lt", "le", "gt", "ge")
 OPERATORS = ("eq", "ne", *ORDERING, "in")
 
@@ -66,8 +68,10 @@ class Selection:
     by: str
     scalar: Scalar | None
     """what is ordered by before the order of submission"""
-    indexed: bool
-    """whether an index has what is filtered by, in another order"""
+    few: tuple[Condition, ...]
+    """what indices have in another order: where one of these gives few jobs, they are the ones to look at"""
+    near: sa.Select[Any] | None
+    """where a range of one index is all that is asked: the first jobs after the cursor, which may be enough"""
 
 
 class WrongQueryError(ValueError):
@@ -183,19 +187,32 @@ def select(
             wrong.append(error.field)
     # A range of one index has all that is asked: it is sorted, which moves numbers only, and not left for the order.
     alone = scalar is None and len({key.key for key in found.values()}) == 1 and len(found) == len(asked)
-    seq = AFTER_RANGE if alone and any(_parts(name)[1] != "eq" for name in found) else jobs.c.seq
+    ranged = alone and any(_parts(name)[1] != "eq" for name in found)
+    seq: sa.ColumnElement[Any] = AFTER_RANGE if ranged else jobs.c.seq
+    near: Condition = sa.true()
+    few = () if alone or not (found or "tag" in given or scalar is not None) else tuple(_few(given, found, sweep))
     try:
         if place := given.get("cursor", [""])[-1]:
             where.append(_after(place, by, scalar, seq))
+            near = _after(place, by, scalar, jobs.c.seq)
     except WrongQueryError as error:
         wrong.append(error.field)
     if wrong:
         raise refused("refused-query", "The query is refused", wrong)
     direction = sa.desc if by.startswith("-") else sa.asc
-    first = () if scalar is None else (direction(scalar.sql),)
-    order = (*first, direction(seq))
-    others = found or "tag" in given or (scalar is not None and {"state", "sweep"} & given.keys())
-    return Selection(sa.and_(sa.true(), *where), order, limit, by, scalar, bool(others) and not alone)
+    order = (direction(seq),) if scalar is None else (direction(scalar.sql), direction(seq))
+    first = sa.select(jobs.c.seq).where(near).order_by(direction(jobs.c.seq)).limit(NEAR) if ranged else None
+    return Selection(sa.and_(sa.true(), *where), order, limit, by, scalar, few, first)
+
+
+def _few(
+    given: Mapping[str, list[str]], found: Mapping[str, Scalar], sweep: Callable[[str], int]
+) -> Iterator[Condition]:
+    """Each filter that an index answers, by itself; what is wrong is told elsewhere."""
+    for name, values in given.items():
+        if name in found or name in ("state", "sweep", "tag"):
+            with suppress(WrongQueryError):
+                yield sa.and_(sa.true(), *_conditions(name, values, sweep, jobs.c.state, name in found))
 
 
 def _parts(name: str) -> tuple[str, str]:

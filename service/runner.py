@@ -115,7 +115,7 @@ class Runner:
     def run(self) -> None:
         """From the record of the start to the record of the end."""
         order, pid = self.order, os.getpid()
-        record = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
+        record: dict[str, Any] = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
         record |= {"cores": order.cores, "started": time.time()}
         write_json(self.directory / "attempt.json", record, durable=False)  # it tells of a process of this boot
         try:

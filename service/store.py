@@ -247,7 +247,7 @@ class Store:
         self._door = threading.Lock()
         self._asking = threading.RLock()
         made = self._ask("SELECT name FROM sqlite_master WHERE type = 'index' AND name GLOB 'asked_*'")
-        self._asked = {name.removeprefix("asked_"): True for (name,) in made}  # the last one asked for last; whether made
+        self._asked = {name.removeprefix("asked_"): True for (name,) in made}  # whether made; the newest last
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
         self._closed = not writable
@@ -521,23 +521,32 @@ class Store:
 
     def page(
         self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int,
-        value: sa.ColumnElement[Any] | None = None, indexed: bool = False,
+        value: sa.ColumnElement[Any] | None = None, few: Sequence[sa.ColumnElement[bool]] = (),
+        near: sa.Select[Any] | None = None,
     ) -> list[tuple[Job, Any]]:  # fmt: skip
         """Jobs that fit, in order, each with the value it is ordered by.
 
-        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `indexed`: an index has what
-        the filter needs, but not in this order; so where few jobs fit they are found by it and sorted, and where many
-        do, a walk along the order meets enough of them soon.
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `few`: parts of the filter, and
+        at last all of it, that indices have in another order; so where few jobs fit one they are found by it and
+        sorted, and where many do, a walk along the order meets enough of them soon. `near`: the beginning of such a
+        walk; where that is not enough, all that fit are sorted.
         """
         with self.reading() as connection:
-            if indexed:
-                few = connection.execute(sa.select(jobs.c.seq).where(where).limit(FEW + 1)).scalars().all()
-                where = jobs.c.seq.in_(few) if len(few) <= FEW else where
-            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
-            places = connection.execute(chosen.order_by(*order).limit(limit)).all()
+            for part in (*few, where) if few or near is not None else ():
+                found = connection.execute(sa.select(jobs.c.seq).where(part).limit(FEW + 1)).scalars().all()
+                if len(found) <= FEW:
+                    where = jobs.c.seq.in_(found) & where
+                    near = None
+                    break
+            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).order_by(*order).limit(limit)
+            places: Sequence[Any] = []
+            if near is not None:
+                places = connection.execute(chosen.where(where, jobs.c.seq.in_(near))).all()
+            if len(places) < limit:
+                places = connection.execute(chosen.where(where)).all()
             rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
-            found = {row.seq: _record(row) for row in rows}
-        return [(found[seq], at) for seq, at in places]
+            records = {row.seq: _record(row) for row in rows}
+        return [(records[seq], at) for seq, at in places]
 
     def indexed(self, key: str, expression: str) -> bool:
         """Whether an index of jobs has what a list is filtered or ordered by.
@@ -571,9 +580,7 @@ class Store:
 
     def queued(self, limit: int) -> list[tuple[int, int]]:
         """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
-        query = (
-            "SELECT seq, ranks FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
-        )
+        query = "SELECT seq, ranks FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
         return self._ask(query, (State.QUEUED, limit))
 
     def unfinished(self) -> tuple[list[tuple[Job, Attempt]], list[Job]]:
@@ -711,7 +718,8 @@ class Store:
         try:
             connection = self._reader.raw_connection()
             try:
-                return connection.cursor().execute(query, values).fetchall()
+                found: list[Any] = connection.cursor().execute(query, values).fetchall()
+                return found
             finally:
                 connection.close()
         except (DBAPIError, sqlite3.Error, sa.exc.TimeoutError) as error:
@@ -799,14 +807,17 @@ def _record(row: Row[Any]) -> Job:
 def _all_with(t: Transaction, column: str, values: Sequence[Any]) -> list[Job]:
     """Jobs that have one of the values in the column; SQLite takes some thousands of them."""
     query = f"SELECT {COLUMNS} FROM jobs WHERE {column} IN ({', '.join('?' * len(values))})"
-    return [
-        Job(*row[:4], State(row[4]), *row[5:8], tuple(json.loads(row[8])), *row[9:12], bool(row[12]), bool(row[13]),
-            *row[14:18], json.loads(row[18]), row[19])
-        for row in t.ask(query, values)
-    ]  # fmt: skip
+    return [_unpacked(dict(zip(jobs.c.keys(), row, strict=True))) for row in t.ask(query, values)]
 
 
-COLUMNS = ", ".join(f'"{column.name}"' for column in jobs.c)  # in the order of `Job`'s fields
+COLUMNS = ", ".join(f'"{name}"' for name in jobs.c.keys())
+
+
+def _unpacked(values: dict[str, Any]) -> Job:
+    """A job from what SQLite keeps."""
+    values |= {"state": State(values["state"]), "tags": tuple(json.loads(values["tags"]))}
+    values |= {"retrying": bool(values["retrying"]), "stopping": bool(values["stopping"])}
+    return Job(**{**values, "result": json.loads(values["result"])})
 
 
 def _by_seq(connection: Connection, seq: int) -> Job:

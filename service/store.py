@@ -807,10 +807,11 @@ def _record(row: Row[Any]) -> Job:
 def _all_with(t: Transaction, column: str, values: Sequence[Any]) -> list[Job]:
     """Jobs that have one of the values in the column; SQLite takes some thousands of them."""
     query = f"SELECT {COLUMNS} FROM jobs WHERE {column} IN ({', '.join('?' * len(values))})"
-    return [_unpacked(dict(zip(jobs.c.keys(), row, strict=True))) for row in t.ask(query, values)]
+    return [_unpacked(dict(zip(NAMES, row, strict=True))) for row in t.ask(query, values)]
 
 
-COLUMNS = ", ".join(f'"{name}"' for name in jobs.c.keys())
+NAMES = [column.name for column in jobs.c]
+COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
 
 
 def _unpacked(values: dict[str, Any]) -> Job:

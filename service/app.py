@@ -153,9 +153,12 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
     store = engine.store
 
     def page() -> tuple[views.JobPage, str | None]:
-        selection = filters.select(request.query_params.multi_items(), lambda name: store.sweep(name).seq)
+        selection = filters.select(
+            request.query_params.multi_items(), lambda name: store.sweep(name).seq,
+            lambda scalar: filters.native(scalar) or store.indexed(scalar.key, filters.sql_of(scalar)),
+        )  # fmt: skip
         value = None if selection.scalar is None else selection.scalar.sql
-        found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.indexed)
+        found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.few, selection.near)
         shown = [views.summary(job, hidden(engine)) for job, _ in found[: selection.limit]]
         following = None
         if len(found) > selection.limit:

@@ -4,23 +4,24 @@ import fcntl
 import json
 import os
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 
 def write_json(path: Path, tree: Any, durable: bool = True) -> None:
     """A reader sees the old file or the new one; durable: the new one is on the disk when this returns."""
-    beside = path.with_name(f"{path.name}.{os.getpid()}.new")
+    beside = f"{path}.{os.getpid()}.new"
     try:
-        with open(beside, "w", encoding="utf-8") as file:
-            json.dump(tree, file)
+        with open(beside, "wb") as file:
+            file.write(json.dumps(tree).encode())
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
         os.replace(beside, path)
     except OSError:
         with suppress(OSError):
-            beside.unlink()
+            os.unlink(beside)
         raise
     if durable:
         flush_folder(path.parent)
@@ -63,6 +64,7 @@ def try_lock(path: Path) -> int | None:
     return handle
 
 
+@cache
 def boot() -> str:
     """The kernel's name for this boot of this machine."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()

@@ -13,6 +13,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
@@ -24,11 +25,12 @@ from frit.solver.case import case_schema
 
 from .jobs import Job, State
 from .problems import WrongField, refused
-from .schema import jobs, sweep_jobs
+from .schema import job_tags, jobs, sweep_jobs
 
 Condition = sa.ColumnElement[bool]
 PAGE = 50  # jobs on a page, unless asked for
 LARGEST_PAGE = 500
+NEAR = 1000  # jobs that are looked at before a range is sorted
 ORDERING = ("lt", "le", "gt", "ge")
 OPERATORS = ("eq", "ne", *ORDERING, "in")
 
@@ -38,11 +40,13 @@ COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
 INDEXED = ("particles.mean_radius", "particles.std_radius", "particles.packing_density", "result.vacancy_ratio")
 RESULTS = ("time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "particles", "evaluations",
            "wall_time", "neck_length", "centre_distance")  # fmt: skip
+NATIVE = (*INDEXED, "id", "identity", "name", "state")  # what the schema has an index of
 PACKING = re.compile(r"result\.packing(\.[A-Za-z_][A-Za-z0-9_]*){1,3}")
 
 
 # The state as SQLite does not look it up in an index: another one is better.
 AFTER_OTHERS: sa.ColumnElement[Any] = sa.literal_column("+jobs.state")
+AFTER_RANGE: sa.ColumnElement[Any] = sa.literal_column("+jobs.seq")
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,10 @@ class Selection:
     by: str
     scalar: Scalar | None
     """what is ordered by before the order of submission"""
-    indexed: bool
-    """whether an index has what is filtered by"""
+    few: tuple[Condition, ...]
+    """what indices have in another order: where one of these gives few jobs, they are the ones to look at"""
+    near: sa.Select[Any] | None
+    """where a range of one index is all that is asked: the first jobs after the cursor, which may be enough"""
 
 
 class WrongQueryError(ValueError):
@@ -108,6 +114,11 @@ def _scalars(node: Mapping[str, Any], schema: Mapping[str, Any], key: str) -> It
         yield key, kind
 
 
+def sql_of(scalar: Scalar) -> str:
+    """The expression of its index."""
+    return f'"{scalar.key}"' if scalar.key in columns() else str(scalar.sql)
+
+
 def _scalar(column: str, key: str, kind: str) -> Scalar:
     prefix = "result." if column == "result" else ""
     quoted = '"case"' if column == "case" else column
@@ -141,41 +152,89 @@ def find(key: str, parameter: str) -> Scalar:
 # --- conditions -------------------------------------------------------------------------------------------
 
 
-def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -> Selection:
-    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpError`."""
+def native(scalar: Scalar) -> bool:
+    """Whether the schema has an index of it."""
+    return scalar.key in NATIVE
+
+
+def select(
+    parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int], index: Callable[[Scalar], bool] = native
+) -> Selection:
+    """What the query parameters ask for; `sweep` gives the seq of a sweep, `index` whether there is one.
+
+    Raises `HttpError`.
+    """
     wrong: list[WrongField] = []
     where: list[Condition] = []
     given: dict[str, list[str]] = {}
     for name, value in parameters:
         given.setdefault(name, []).append(value)
     by = given.get("order", ["-created"])[-1]
-    indexed = any(name.startswith(INDEXED) and not name.endswith(".ne") for name in given)
-    state = AFTER_OTHERS if indexed or by.removeprefix("-") in INDEXED else jobs.c.state
-    for name, values in given.items():
-        try:
-            if name not in ("order", "limit", "cursor"):
-                where.extend(_conditions(name, values, sweep, state))
-        except WrongQueryError as error:
-            wrong.append(error.field)
-    limit, scalar = PAGE, None
+    asked = [name for name in given if name not in ("order", "limit", "cursor")]
+    found = {name: scalar for name in asked if (scalar := _scalar_of(name)) is not None and index(scalar)}
+    limit, scalar, ordered = PAGE, None, False
     try:
         scalar = _order(by)
+        ordered = scalar is not None and index(scalar)
         limit = _limit(given.get("limit", [str(PAGE)])[-1])
+    except WrongQueryError as error:
+        wrong.append(error.field)
+    state = AFTER_OTHERS if found or ordered else jobs.c.state
+    for name in asked:
+        try:
+            where.extend(_conditions(name, given[name], sweep, state, name in found))
+        except WrongQueryError as error:
+            wrong.append(error.field)
+    # A range of one index has all that is asked: it is sorted, which moves numbers only, and not left for the order.
+    alone = scalar is None and len({key.key for key in found.values()}) == 1 and len(found) == len(asked)
+    ranged = alone and any(_parts(name)[1] != "eq" for name in found)
+    seq: sa.ColumnElement[Any] = AFTER_RANGE if ranged else jobs.c.seq
+    near: Condition = sa.true()
+    few = () if alone or not (found or "tag" in given or scalar is not None) else tuple(_few(given, found, sweep))
+    try:
         if place := given.get("cursor", [""])[-1]:
-            where.append(_after(place, by, scalar))
+            where.append(_after(place, by, scalar, seq))
+            near = _after(place, by, scalar, jobs.c.seq)
     except WrongQueryError as error:
         wrong.append(error.field)
     if wrong:
         raise refused("refused-query", "The query is refused", wrong)
     direction = sa.desc if by.startswith("-") else sa.asc
-    first = () if scalar is None else (direction(scalar.sql),)
-    order = (*first, direction(jobs.c.seq))
-    return Selection(sa.and_(sa.true(), *where), order, limit, by, scalar, indexed and scalar is None)
+    order = (direction(seq),) if scalar is None else (direction(scalar.sql), direction(seq))
+    first = sa.select(jobs.c.seq).where(near).order_by(direction(jobs.c.seq)).limit(NEAR) if ranged else None
+    return Selection(sa.and_(sa.true(), *where), order, limit, by, scalar, few, first)
+
+
+def _few(
+    given: Mapping[str, list[str]], found: Mapping[str, Scalar], sweep: Callable[[str], int]
+) -> Iterator[Condition]:
+    """Each filter that an index answers, by itself; what is wrong is told elsewhere."""
+    for name, values in given.items():
+        if name in found or name in ("state", "sweep", "tag"):
+            with suppress(WrongQueryError):
+                yield sa.and_(sa.true(), *_conditions(name, values, sweep, jobs.c.state, name in found))
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """The key and the operator of a filter."""
+    key, dot, verb = name.rpartition(".")
+    return (key, verb) if dot and verb in OPERATORS and name not in known() else (name, "eq")
+
+
+def _scalar_of(name: str) -> Scalar | None:
+    """What a filter compares; None for a list of its own, and for a key that there is not."""
+    if name in ("state", "sweep", "tag"):
+        return None
+    try:
+        return find(_parts(name)[0], name)
+    except WrongQueryError:
+        return None
 
 
 def _conditions(
-    name: str, values: list[str], sweep: Callable[[str], int], state: sa.ColumnElement[Any]
+    name: str, values: list[str], sweep: Callable[[str], int], state: sa.ColumnElement[Any], found: bool
 ) -> Iterator[Condition]:
+    """`found`: by an index."""
     if name == "state":
         states = [state for value in values for state in value.split(",")]
         if unknown := [state for state in states if state not in list(State)]:
@@ -186,23 +245,26 @@ def _conditions(
             yield jobs.c.seq.in_(sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep(value)))
     elif name == "tag":
         for value in values:
-            each = sa.func.json_each(jobs.c.tags).table_valued("value")
-            yield sa.exists(sa.select(sa.literal(1)).select_from(each).where(each.c.value == value))
+            yield jobs.c.seq.in_(sa.select(job_tags.c.job).where(job_tags.c.tag == value))
     else:
-        key, dot, verb = name.rpartition(".")
-        if not dot or verb not in OPERATORS or name in known():
-            key, verb = name, "eq"
+        key, verb = _parts(name)
         scalar = find(key, name)
         for value in values:
-            yield _condition(scalar, verb, value, name)
+            yield _condition(scalar, verb, value, name, found)
 
 
-def _condition(scalar: Scalar, verb: str, text: str, parameter: str) -> Condition:
+def _condition(scalar: Scalar, verb: str, text: str, parameter: str, found: bool) -> Condition:
     if verb in ORDERING and scalar.kind in ("string", "boolean"):
         raise WrongQueryError(parameter, text, f"{scalar.key} is a {scalar.kind}: only eq, ne and in are possible")
     if verb == "in":
         return scalar.sql.in_([_typed(scalar, part, parameter) for part in text.split(",")])
     value = _typed(scalar, text, parameter)
+    if verb == "ne" and found:  # an index has ranges
+        return _condition_of(scalar, "lt", value) | _condition_of(scalar, "gt", value)
+    return _condition_of(scalar, verb, value)
+
+
+def _condition_of(scalar: Scalar, verb: str, value: Any) -> Condition:
     return sa.type_coerce(COMPARE[verb](scalar.sql, sa.bindparam(None, value)), sa.Boolean)
 
 
@@ -254,7 +316,7 @@ def cursor(selection: Selection, last: Job, value: Any) -> str:
     return base64.urlsafe_b64encode(place.encode()).decode().rstrip("=")
 
 
-def _after(text: str, by: str, scalar: Scalar | None) -> Condition:
+def _after(text: str, by: str, scalar: Scalar | None, at: sa.ColumnElement[Any]) -> Condition:
     """Jobs that come after the cursor's. NULL is the smallest value, as SQLite orders it."""
     try:
         place = json.loads(base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True))
@@ -265,7 +327,7 @@ def _after(text: str, by: str, scalar: Scalar | None) -> Condition:
     if not good:
         raise WrongQueryError("cursor", text, f"must come from the page before, with the same order ({by})")
     descending = by.startswith("-")
-    later: Condition = jobs.c.seq < seq if descending else jobs.c.seq > seq
+    later: Condition = at < seq if descending else at > seq
     if scalar is None:
         return later
     e = scalar.sql

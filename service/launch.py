@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
+from .child import Child
 from .files import read_json, stamp
 
 ENDS = ("done", "failed", "interrupted", "refused")
@@ -64,9 +64,13 @@ def find_mpirun() -> str:
     return found
 
 
-@cache
 def is_open_mpi(mpirun: str) -> bool:
-    """mpich's hydra answers `HYDRA build details`."""
+    """mpich's hydra answers `HYDRA build details`. Asked once, until the program is another."""
+    return _is_open_mpi(mpirun, stamp(Path(mpirun)))
+
+
+@cache
+def _is_open_mpi(mpirun: str, _: tuple[int, int] | None) -> bool:
     shown = subprocess.run([mpirun, "--version"], capture_output=True, text=True, check=False)
     return "Open MPI" in shown.stdout or "OpenRTE" in shown.stdout
 
@@ -103,44 +107,36 @@ class Launch:
         directory: Path,
         marks: Mapping[str, str] | None = None,
         first: Callable[[], None] | None = None,
+        adopts: bool = False,
     ) -> None:
-        """marks: more for the environment of the tree; first: called in mpirun's process before it is mpirun."""
+        """marks: more for the environment of the tree; first: called in mpirun's process before it is mpirun.
+
+        adopts: whether orphans come to this process (PR_SET_CHILD_SUBREAPER), and nothing else it starts lives.
+        """
         command = mpirun_command(ranks, arguments)
         environment = (OPEN_MPI if is_open_mpi(command[0]) else {}) | clean_environment(os.environ)
         # mpich gives each rank a session of its own: only a mark finds those whose mpirun is gone.
-        environment |= {"FRIT_LAUNCH": uuid.uuid4().hex, **(marks or {})}
+        environment |= {"FRIT_LAUNCH": os.urandom(16).hex(), **(marks or {})}
         self._mark = f"FRIT_LAUNCH={environment['FRIT_LAUNCH']}"
-        self.directory, self.stopping = directory, False
+        self.directory, self.stopping, self._adopts = directory, False, adopts
         self._spoken: deque[str] = deque(maxlen=40)
         directory.mkdir(parents=True, exist_ok=True)
         self._record_before = stamp(directory / "run.json")
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            encoding="utf-8",
-            errors="replace",
-            env=environment,
-            start_new_session=True,
-            preexec_fn=first,
-        )
-        self._reaper = threading.Thread(target=self._reap, daemon=True)
-        self._reaper.start()
+        self._process = Child(command, environment, first)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._process.poll() is None:
+        if self.alive:
             self.kill()
-        self._reaper.join()
-        if self._process.stdout:
-            self._process.stdout.close()
+            self._process.wait()
+            self._sweep_up()
+        self._process.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """Progress as rank 0 prints it, until mpirun ends; what else is said is kept for the Outcome."""
-        for line in self._process.stdout or ():
+        for line in self._process.lines(self._sweep_up):
             progress = None
             with suppress(json.JSONDecodeError):
                 progress = json.loads(line)
@@ -152,32 +148,31 @@ class Launch:
     @property
     def alive(self) -> bool:
         """Whether mpirun still runs."""
-        return self._process.poll() is None
+        return self._process.returncode is None
 
     def checkpoint(self) -> None:
         """Ask the ranks for a checkpoint now."""
-        self._process.send_signal(signal.SIGUSR1)
+        self._process.send(signal.SIGUSR1)
 
     def stop(self, grace: float) -> None:
         """Ask for a checkpoint and the end; kill after `grace` seconds. Returns at once, counts once."""
         if not self.stopping:
             self.stopping = True
-            self._process.send_signal(signal.SIGTERM)
+            self._process.send(signal.SIGTERM)
             timer = threading.Timer(grace, self.kill)
             timer.daemon = True
             timer.start()
 
     def kill(self) -> bool:
         """Kill mpirun and whatever carries the mark; true if any did."""
-        self._process.kill()
+        self._process.send(signal.SIGKILL)
         return kill_marked(self._mark)
 
     def wait(self) -> Outcome:
         """What run.json says, if it was written since the start, once the whole tree is gone."""
         for _ in self:
             pass
-        self._reaper.join()
-        record, code, spoken = read_record(self.directory), self._process.returncode, "\n".join(self._spoken)
+        record, code, spoken = read_record(self.directory), self._process.wait(), "\n".join(self._spoken)
         fresh = stamp(self.directory / "run.json") != self._record_before
         if fresh and record.get("state") in ENDS:
             return Outcome(record["state"], record.get("message"), code, spoken, record.get("retry", False))
@@ -190,13 +185,22 @@ class Launch:
         message = f"mpirun ended with status {code} and no word of the solver"
         return Outcome("failed", message, code, spoken, retry=True)
 
-    def _reap(self) -> None:
+    def _sweep_up(self) -> None:
         """mpirun's end is the end of all: no orphan stays."""
-        self._process.wait()
         for _ in range(100):
-            if not self.kill():
+            if (self._adopts and childless()) or not self.kill():
                 break
             time.sleep(0.01)
+
+
+def childless() -> bool:
+    """Whether no child of this process lives; those that have ended are taken leave of."""
+    try:
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+    except ChildProcessError:
+        return True
+    return False
 
 
 def kill_marked(mark: str) -> bool:

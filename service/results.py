@@ -124,12 +124,11 @@ class Follower:
                 if rows or snapshots:
                     await asyncio.wrap_future(self.store.ingest(seq, rows, snapshots))
 
-    async def finish(self, job: Job) -> None:
-        """Take in the last of a job, and what it is found by."""
+    async def finish(self, job: Job) -> dict[str, Any]:
+        """Take in the last of a job; what it is found by."""
         reader = self._readers.pop(job.id, None) or Reader(self.runs / job.id, job.case)
         self._progress.pop(job.id, None)
-        rows, snapshots = await asyncio.to_thread(reader.news)
+        (rows, snapshots), result = await asyncio.to_thread(lambda: (reader.news(), reader.result()))
         if rows or snapshots:
             await asyncio.wrap_future(self.store.ingest(job.seq, rows, snapshots))
-        if result := await asyncio.to_thread(reader.result):
-            await asyncio.wrap_future(self.store.set_result(job.seq, result))
+        return result

@@ -12,6 +12,7 @@ that they need (`nursery`): a start costs two milliseconds, and the service itse
 """
 
 import ctypes
+import gc
 import json
 import os
 import signal
@@ -28,12 +29,13 @@ from typing import Any, NoReturn
 
 from .files import boot, read_json, stamp, start_of, try_lock, write_json
 from .jobs import Exit, Move
-from .launch import Launch, LaunchError, Outcome, kill_marked, read_record
+from .launch import Launch, LaunchError, Outcome, find_mpirun, is_open_mpi, kill_marked, read_record
 
 LONGEST = 65_536  # bytes of an order
 PROGRESS_EVERY = 0.5  # seconds between two writes of progress.json
 STUBBORN = 60.0  # seconds for which an exit record that cannot be written (a full disk) is tried again
-PR_SET_PDEATHSIG = 1
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
+prctl = ctypes.CDLL(None).prctl
 STOPS = {"cancelled": Move.STOP, "timed_out": Move.TIME_OUT, "released": Move.RELEASE}
 
 
@@ -55,10 +57,14 @@ class Order:
 def nursery(orders: socket.socket) -> None:
     """Fork a runner for each order (JSON, and the lock's descriptor), answer with its pid; until the socket ends."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
+    gc.disable()  # what is looked through is copied in every runner
+    gc.freeze()
     while True:
         message, handles, _, _ = socket.recv_fds(orders, LONGEST, 1)
         if not message:
             return
+        with suppress(LaunchError, OSError):  # the runner says so itself
+            is_open_mpi(find_mpirun())
         if (pid := os.fork()) == 0:
             orders.close()
             born(Order(**json.loads(message)), handles[0])
@@ -74,12 +80,13 @@ def born(order: Order, lock: int) -> NoReturn:
     try:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.setsid()
+        adopts = prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) == 0
         log = os.open(Path(order.directory) / "runner.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         for descriptor in (1, 2):
             os.dup2(log, descriptor)
         os.close(log)
         os.set_inheritable(lock, False)
-        Runner(order).run()
+        Runner(order, adopts).run()
         status = 0
     except BaseException:
         traceback.print_exc()
@@ -93,10 +100,10 @@ def born(order: Order, lock: int) -> NoReturn:
 
 
 class Runner:
-    """One attempt at one job."""
+    """One attempt at one job. `adopts`: whether the orphans of what it starts come to it."""
 
-    def __init__(self, order: Order) -> None:
-        self.order, self.directory = order, Path(order.directory)
+    def __init__(self, order: Order, adopts: bool) -> None:
+        self.order, self.directory, self.adopts = order, Path(order.directory), adopts
         self.mark = f"FRIT_RUN={self.directory}"
         self.began = time.monotonic()
         self.launch: Launch | None = None
@@ -108,8 +115,9 @@ class Runner:
     def run(self) -> None:
         """From the record of the start to the record of the end."""
         order, pid = self.order, os.getpid()
-        record = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
-        write_json(self.directory / "attempt.json", {**record, "cores": order.cores, "started": time.time()})
+        record: dict[str, Any] = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
+        record |= {"cores": order.cores, "started": time.time()}
+        write_json(self.directory / "attempt.json", record, durable=False)  # it tells of a process of this boot
         try:
             move, message = self.attempt()
         except Exception as error:
@@ -130,7 +138,9 @@ class Runner:
             return Move.SUCCEED, None
         os.sched_setaffinity(0, self.order.cores)
         try:
-            launch = Launch(self.order.ranks, self.arguments(), self.directory, self.marks(), die_with(os.getpid()))
+            launch = Launch(
+                self.order.ranks, self.arguments(), self.directory, self.marks(), die_with(os.getpid()), self.adopts
+            )
         except (LaunchError, OSError) as error:
             return Move.BREAK, str(error)
         with launch:
@@ -250,8 +260,6 @@ def timer(seconds: float, call: Callable[[], None]) -> None:
 
 def die_with(parent: int) -> Callable[[], None]:
     """For the child after the fork: be killed when the parent is."""
-    prctl = ctypes.CDLL(None).prctl
-
     def tie() -> None:
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != parent:  # it died before the line above

@@ -13,7 +13,7 @@ from typing import Any
 from .backends.local import BackendError, LocalBackend
 from .files import boot, start_of, write_json
 from .hub import Hub
-from .jobs import Exit, Job, Move
+from .jobs import Exit, Job, Move, State
 from .results import Follower
 from .runner import Order
 from .settings import Settings, own_cores
@@ -95,9 +95,9 @@ class Scheduler:
         """Give free cores to the jobs whose turn it is: one query, and one transaction if there are any."""
         if not (self.free and self.open) or self._disk() is not None:
             return
-        queue = await asyncio.to_thread(self.store.queued, AHEAD)
-        ranks = dict(queue)
         choices, free = [], sorted(self.free)
+        queue = self._ahead(len(free))
+        ranks = dict(queue)
         for seq in choose(queue, len(free), len(self.cores), self._overtake):
             choices.append((seq, free[: ranks[seq]]))
             free = free[ranks[seq] :]
@@ -109,6 +109,11 @@ class Scheduler:
             self.free -= set(given[job.seq])
             self.running[job.id] = job
             self._spawn(self._start(job, set(given[job.seq])))
+
+    def _ahead(self, free: int) -> list[tuple[int, int]]:
+        """(seq, ranks) of the first in the queue: as many as there are cores free where those fit, else `AHEAD`."""
+        queue = self.store.queued(free)
+        return queue if sum(ranks for _, ranks in queue) <= free or len(queue) < free else self.store.queued(AHEAD)
 
     def _overtake(self, first: int) -> bool:
         """Whether the first job that does not fit may be overtaken: for a while since it became the first."""
@@ -169,9 +174,10 @@ class Scheduler:
             if record is None:
                 return await self._end(job, cores, Exit(job.attempt, Move.BREAK, str(error), time.time()))
             pid = int(record["pid"])  # it was forked all the same: only the answer was lost
+        beside = None
         if (started := start_of(pid)) is not None:
-            await self._started(job, pid, started, boot())
-        await self._watch(job, cores)
+            beside = self._spawn(self._started(job, pid, started, boot()))
+        await self._watch(job, cores, pid, beside)
 
     async def _bear(self, job: Job, order: Order) -> int:
         """Not to be cut short: a claimed job gets its runner."""
@@ -190,25 +196,31 @@ class Scheduler:
         directory = self.settings.runs / job.id
         directory.mkdir(parents=True, exist_ok=True)
         record = await self.backend.recorded(directory, job.attempt)
-        if record is None:
+        if record is None and job.state is State.STARTING:
             message = "the service ended before it had started a runner"
             return await self._end(job, cores, Exit(job.attempt, Move.RELEASE, message, time.time()))
-        await self._started(job, record["pid"], record["pid_start"], record["boot"])
+        if record is not None:
+            await self._started(job, record["pid"], record["pid_start"], record["boot"])
         await self._watch(job, cores)
 
-    async def _watch(self, job: Job, cores: set[int]) -> None:
-        """To the end of the job's runner, which may have come already."""
+    async def _watch(
+        self, job: Job, cores: set[int], pid: int | None = None, beside: asyncio.Task[None] | None = None
+    ) -> None:
+        """To the end of the job's runner, which may have come already; `beside`: what has to be told before that."""
         directory = self.settings.runs / job.id
-        end = await self.backend.ended(directory, job.attempt)
+        end = await self.backend.ended(directory, job.attempt, pid)
+        if beside is not None:
+            await asyncio.wait([beside])
         if end is None:
             end = Exit(job.attempt, Move.LOSE, "the runner vanished without an exit record", time.time())
         await self._end(job, cores, end)
 
     async def _end(self, job: Job, cores: set[int], end: Exit) -> None:
         """Into the index with it, history first, and its cores back."""
+        result: dict[str, Any] = {}
         while True:
             try:
-                await self.follower.finish(job)
+                result = await self.follower.finish(job)
                 break
             except (StoreError, OSError) as error:
                 self._complain(f"job {job.id}: {error}")
@@ -216,7 +228,8 @@ class Scheduler:
             except Exception as error:  # a damaged file: the job has ended all the same
                 logger.warning("job %s: %s: %s", job.id, type(error).__name__, error)
                 break
-        ended = await self._insist(lambda: self.store.finish(job.id, end, self.settings.attempts))
+        limit = self.settings.attempts
+        ended = await self._insist(lambda: self.store.finish(job.id, end, limit, result or None))
         self.running.pop(job.id, None)
         self.free |= cores
         if ended.retrying:
@@ -248,10 +261,11 @@ class Scheduler:
                 self._complain(str(error))
             await asyncio.sleep(self.settings.poll)
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._done)
+        return task
 
     def _done(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)

@@ -62,12 +62,21 @@ jobs = Table(
     Column("case", Text, nullable=False),  # the resolved case, compact JSON
     sqlite_autoincrement=True,
 )
+Index("ix_jobs_name", jobs.c.name)
 Index("ix_jobs_queue", jobs.c.state, jobs.c.priority.desc(), jobs.c.seq)
 Index("ix_jobs_state_seq", jobs.c.state, jobs.c.seq)
 for key in ("mean_radius", "std_radius", "packing_density"):  # what sweeps are made of
     Index(f"ix_jobs_{key}", func.json_extract(jobs.c.case, literal_column(f"'$.particles.{key}'")))
 # ... and what they lead to
 Index("ix_jobs_vacancy_ratio", func.json_extract(jobs.c.result, literal_column("'$.vacancy_ratio'")))
+
+job_tags = Table(  # filled by a trigger on `jobs`
+    "job_tags",
+    metadata,
+    Column("tag", Text, primary_key=True),
+    Column("job", ForeignKey(jobs.c.seq), primary_key=True),
+    sqlite_with_rowid=False,
+)
 
 sweep_jobs = Table(
     "sweep_jobs",

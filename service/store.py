@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -28,6 +29,7 @@ from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
 from .schema import attempts, events, history, idempotency, jobs, snapshots, sweep_jobs, sweeps
 
 BATCH = 256  # pieces of work in one transaction, at most
+ASKED = 16  # indices that questions have made, at most
 FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
 SUCCEEDED = 1 << 60  # more than any seq
@@ -141,9 +143,41 @@ class Transaction:
         """Execute; `rows` for many at once."""
         return cast("sa.CursorResult[Any]", self.connection.execute(statement, rows))
 
+    def ask(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """What is asked all the time: no layer between it and SQLite."""
+        found: list[tuple[Any, ...]] = self.raw.execute(query, values).fetchall()
+        return found
+
+    def add(self, table: sa.Table, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Insert rows that all have the same columns, as SQLite keeps them."""
+        if rows:
+            self.raw.executemany(_addition(table.name, tuple(rows[0])), rows)
+
+    def change(self, table: sa.Table, which: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+        """Change the rows that have these values in the columns `which`; all change the same other columns."""
+        if rows:
+            self.raw.executemany(_change(table.name, tuple(rows[0]), tuple(which)), rows)
+
+    @property
+    def raw(self) -> sqlite3.Connection:
+        """SQLite's own connection."""
+        return cast("sqlite3.Connection", self.connection.connection.dbapi_connection)
+
     def note(self, kind: str, **line: Any) -> None:
         """A line of the journal: what a lost index is rebuilt from."""
         self.lines.append(json.dumps({"kind": kind, **line}) + "\n")
+
+
+@lru_cache
+def _addition(table: str, columns: tuple[str, ...]) -> str:
+    names, values = ", ".join(f'"{name}"' for name in columns), ", ".join(f":{name}" for name in columns)
+    return f"INSERT INTO {table} ({names}) VALUES ({values})"
+
+
+@lru_cache
+def _change(table: str, columns: tuple[str, ...], which: tuple[str, ...]) -> str:
+    changed = ", ".join(f'"{name}" = :{name}' for name in columns if name not in which)
+    return f"UPDATE {table} SET {changed} WHERE {' AND '.join(f'{name} = :{name}' for name in which)}"
 
 
 @dataclass
@@ -153,15 +187,42 @@ class _Work:
 
 
 @dataclass(frozen=True)
-class _Submission:
-    """Work that is done for many at once: a job to be queued."""
+class _Share:
+    """Work that is done for many at once: `effect` takes all that have it, and answers each; an error is one's own."""
 
-    job: NewJob
-    key: Key | None
+    effect: Callable[[Transaction, Sequence[Any]], Sequence[Any]]
+    wanted: Any
     answer: Future[Any]
 
 
-_Piece = tuple[Sequence[_Work | _Submission], Callable[[Transaction], Sequence[Any]]]
+_Piece = tuple[Sequence[_Work | _Share], Callable[[Transaction], Sequence[Any]]]
+
+
+@dataclass(frozen=True)
+class _Submission:
+    """A job to be queued."""
+
+    job: NewJob
+    key: Key | None
+
+
+@dataclass(frozen=True)
+class _Start:
+    """An attempt whose runner has recorded itself."""
+
+    job: str
+    attempt: int
+    process: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _End:
+    """An attempt that has ended."""
+
+    job: str
+    end: Exit
+    attempts_limit: int
+    result: Mapping[str, Any] | None
 
 
 class Store:
@@ -182,8 +243,11 @@ class Store:
                 self._writer.connect().close()  # the log must be there before the first reader is
             except DBAPIError as error:
                 raise StoreError(f"{self.path}: {_words(error)}") from error
-        self._waiting: queue.SimpleQueue[_Work | _Submission | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[_Work | _Share | None] = queue.SimpleQueue()
         self._door = threading.Lock()
+        self._asking = threading.RLock()
+        made = self._ask("SELECT name FROM sqlite_master WHERE type = 'index' AND name GLOB 'asked_*'")
+        self._asked = {name.removeprefix("asked_"): True for (name,) in made}  # whether made; the newest last
         self.listeners: list[Callable[[], None]] = []  # called in the writer's thread after each commit
         self._thread = threading.Thread(target=self._write, name="frit-store", daemon=True)
         self._closed = not writable
@@ -207,7 +271,7 @@ class Store:
         """Have the effect done in a transaction; the future is done when it is durable."""
         return self._put(_Work(effect, Future()))
 
-    def _put(self, work: "_Work | _Submission") -> "Future[Any]":
+    def _put(self, work: "_Work | _Share") -> "Future[Any]":
         with self._door:
             if self._closed:
                 raise StoreError(f"{self.path}: closed, or opened for reading only")
@@ -216,16 +280,16 @@ class Store:
 
     def _write(self) -> None:
         while (work := self._waiting.get()) is not None:
-            batch: list[_Work | _Submission | None] = [work]
+            batch: list[_Work | _Share | None] = [work]
             while len(batch) < BATCH and not self._waiting.empty():
                 batch.append(self._waiting.get())
             self._commit([work for work in batch if work is not None])
             if batch[-1] is None:
                 return
 
-    def _commit(self, batch: Sequence[_Work | _Submission]) -> None:
+    def _commit(self, batch: Sequence[_Work | _Share]) -> None:
         batch = [work for work in batch if work.answer.set_running_or_notify_cancel()]  # nobody waits for the others
-        answers: list[tuple[_Work | _Submission, Any]] = []
+        answers: list[tuple[_Work | _Share, Any]] = []
         done: list[Transaction] = []
         pieces = _pieces(batch)
         try:
@@ -234,7 +298,7 @@ class Store:
                     works, effect = pieces.pop(0)
                     transaction = Transaction(connection)
                     try:
-                        with connection.begin_nested():
+                        with _savepoint(transaction.raw):
                             results = effect(transaction)
                         answers += zip(works, results, strict=True)
                         done.append(transaction)
@@ -305,7 +369,7 @@ class Store:
 
     def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
-        return self._put(_Submission(job, key, Future()))
+        return self._put(_Share(_submit, _Submission(job, key), Future()))
 
     def submit_sweep(
         self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
@@ -321,11 +385,10 @@ class Store:
             members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
             t.note("sweep", **row, points=members)
             rows = [
-                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": parameters}
+                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": _compact(parameters)}
                 for i, (job, label, parameters) in enumerate(members)
             ]
-            if rows:
-                t.run(sweep_jobs.insert(), rows)
+            t.add(sweep_jobs, rows)
             _remember(t, key, identifier)
             return _sweep(t.connection, identifier)
 
@@ -337,55 +400,32 @@ class Store:
         """Give queued jobs (by seq) their cores. One that is not queued any more is left out."""
 
         def effect(t: Transaction) -> list[Job]:
-            cores, now, claimed, rows = dict(choices), time.time(), list[Job](), list[dict[str, Any]]()
-            chosen = sa.select(jobs).where(jobs.c.seq.in_(cores), jobs.c.state == State.QUEUED)
-            for job in map(_record, t.run(chosen).all()):
-                number, started = job.attempt + 1, job.started or now
-                claimed.append(_move(t, job, Move.CLAIM, None, attempt=number, started=started, ended=None))
-                rows.append({"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now})
-                t.note("attempt", **rows[-1])
-            if rows:
-                t.run(attempts.insert(), rows)
-            return claimed
+            cores, now, rows, moves = dict(choices), time.time(), list[dict[str, Any]](), _Moves(t)
+            for job in _all_with(t, "seq", list(cores)):
+                if job.state is State.QUEUED:
+                    number, started = job.attempt + 1, job.started or now
+                    moves.add(job, Move.CLAIM, None, attempt=number, started=started, ended=None)
+                    row = {"job": job.seq, "number": number, "cores": list(cores[job.seq]), "claimed": now}
+                    t.note("attempt", **row)
+                    rows.append({**row, "cores": _compact(row["cores"])})
+            t.add(attempts, rows)
+            return moves.made()
 
         return self.write(effect)
 
     def start(self, identifier: str, attempt: int, pid: int, pid_start: int, boot: str) -> "Future[Job]":
         """The runner of an attempt has recorded itself. Told twice it counts once."""
+        process = {"pid": pid, "pid_start": pid_start, "boot": boot}
+        return self._put(_Share(_start, _Start(identifier, attempt, process), Future()))
 
-        def effect(t: Transaction) -> Job:
-            job = _job(t.connection, identifier)
-            if (job.attempt, job.state) != (attempt, State.STARTING):
-                return job
-            _set_attempt(t, job, pid=pid, pid_start=pid_start, boot=boot)
-            return _move(t, job, Move.START, None)
+    def finish(
+        self, identifier: str, end: Exit, attempts_limit: int, result: Mapping[str, Any] | None = None
+    ) -> "Future[Job]":
+        """An attempt has ended. Told twice, or of an attempt that is not the present one, it counts once.
 
-        return self.write(effect)
-
-    def finish(self, identifier: str, end: Exit, attempts_limit: int) -> "Future[Job]":
-        """An attempt has ended. Told twice, or of an attempt that is not the present one, it counts once."""
-
-        def effect(t: Transaction) -> Job:
-            job = _job(t.connection, identifier)
-            if job.attempt != end.attempt or not job.state.active:
-                return job
-            broke = end.move in (Move.BREAK, Move.LOSE)
-            move = end.move
-            if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
-                broke, move = False, Move.STOP
-            state = after(job.state, move)
-            _set_attempt(
-                t, job, ended=end.ended, state=state, message=end.message, core_seconds=end.core_seconds
-            )  # fmt: skip
-            failures = job.failures + 1 if broke else 0
-            return _move(
-                t, job, move, end.message, failures=failures, retrying=broke and failures < attempts_limit,
-                stopping=False,
-                ended=None if state is State.QUEUED else end.ended,
-                core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
-            )  # fmt: skip
-
-        return self.write(effect)
+        result: the scalars by which the job is found from now on; None: those it has.
+        """
+        return self._put(_Share(_finish, _End(identifier, end, attempts_limit, result), Future()))
 
     def requeue(self, identifier: str, attempt: int) -> "Future[Job]":
         """The pause after a broken attempt is over."""
@@ -462,10 +502,7 @@ class Store:
     def set_result(self, seq: int, result: Mapping[str, Any]) -> "Future[None]":
         """The scalars by which finished jobs are found."""
 
-        def effect(t: Transaction) -> None:
-            t.run(jobs.update().where(jobs.c.seq == seq).values(result=dict(result)))
-
-        return self.write(effect)
+        return self.write(lambda t: _set_results(t, {seq: result}))
 
     # --- looking ------------------------------------------------------------------------------------------
 
@@ -484,32 +521,67 @@ class Store:
 
     def page(
         self, where: sa.ColumnElement[bool], order: Sequence[Any], limit: int,
-        value: sa.ColumnElement[Any] | None = None, indexed: bool = False,
+        value: sa.ColumnElement[Any] | None = None, few: Sequence[sa.ColumnElement[bool]] = (),
+        near: sa.Select[Any] | None = None,
     ) -> list[tuple[Job, Any]]:  # fmt: skip
         """Jobs that fit, in order, each with the value it is ordered by.
 
-        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `indexed`: an index has what
-        the filter needs, but not in this order; so where few jobs fit they are found by it and sorted, and where many
-        do, a walk along the order meets enough of them soon.
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `few`: parts of the filter, and
+        at last all of it, that indices have in another order; so where few jobs fit one they are found by it and
+        sorted, and where many do, a walk along the order meets enough of them soon. `near`: the beginning of such a
+        walk; where that is not enough, all that fit are sorted.
         """
         with self.reading() as connection:
-            if indexed:
-                few = connection.execute(sa.select(jobs.c.seq).where(where).limit(FEW + 1)).scalars().all()
-                where = jobs.c.seq.in_(few) if len(few) <= FEW else where
-            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).where(where)
-            places = connection.execute(chosen.order_by(*order).limit(limit)).all()
+            for part in (*few, where) if few or near is not None else ():
+                found = connection.execute(sa.select(jobs.c.seq).where(part).limit(FEW + 1)).scalars().all()
+                if len(found) <= FEW:
+                    where = jobs.c.seq.in_(found) & where
+                    near = None
+                    break
+            chosen = sa.select(jobs.c.seq, sa.null() if value is None else value).order_by(*order).limit(limit)
+            places: Sequence[Any] = []
+            if near is not None:
+                places = connection.execute(chosen.where(where, jobs.c.seq.in_(near))).all()
+            if len(places) < limit:
+                places = connection.execute(chosen.where(where)).all()
             rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
-            found = {row.seq: _record(row) for row in rows}
-        return [(found[seq], at) for seq, at in places]
+            records = {row.seq: _record(row) for row in rows}
+        return [(records[seq], at) for seq, at in places]
+
+    def indexed(self, key: str, expression: str) -> bool:
+        """Whether an index of jobs has what a list is filtered or ordered by.
+
+        If not, one is made, for those who ask again; of too many the one that was not asked for longest goes. Few jobs
+        need none.
+        """
+        with self._asking:
+            made = self._asked.pop(key, None)
+            if made is None:
+                if self._closed or self._ask("SELECT count(*) FROM (SELECT 1 FROM jobs LIMIT ?)", (FEW,))[0][0] < FEW:
+                    return False
+                gone = [name for name, _ in zip(self._asked, range(len(self._asked) + 1 - ASKED), strict=False)]
+                for name in gone:
+                    del self._asked[name]
+                self._asked[key] = False
+                with suppress(StoreError):
+                    self.write(lambda t: _change_indices(t, key, expression, gone)).add_done_callback(
+                        lambda done: self._found(key, done.exception() is None)
+                    )
+            else:
+                self._asked[key] = made
+            return self._asked.get(key, False)
+
+    def _found(self, key: str, made: bool) -> None:
+        with self._asking:
+            if made and key in self._asked:
+                self._asked[key] = True
+            elif not made:
+                self._asked.pop(key, None)
 
     def queued(self, limit: int) -> list[tuple[int, int]]:
         """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
-        query = (
-            sa.select(jobs.c.seq, jobs.c.ranks).where(jobs.c.state == State.QUEUED)
-            .order_by(jobs.c.priority.desc(), jobs.c.seq).limit(limit)
-        )  # fmt: skip
-        with self.reading() as connection:
-            return [(row.seq, row.ranks) for row in connection.execute(query)]
+        query = "SELECT seq, ranks FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
+        return self._ask(query, (State.QUEUED, limit))
 
     def unfinished(self) -> tuple[list[tuple[Job, Attempt]], list[Job]]:
         """Jobs that have cores with their present attempt, and jobs that wait for another attempt."""
@@ -637,17 +709,20 @@ class Store:
     # --- tokens -------------------------------------------------------------------------------------------
 
     def active_tokens(self) -> dict[str, Token]:
-        """The tokens that count now, by hash. Asked at every request: no layer between it and SQLite."""
+        """The tokens that count now, by hash."""
+        rows = self._ask("SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL")
+        return {hashed: Token(name, scope, created, None) for hashed, name, scope, created in rows}
+
+    def _ask(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
+        """What is asked all the time: no layer between it and SQLite."""
         try:
             connection = self._reader.raw_connection()
             try:
-                rows = connection.cursor().execute(
-                    "SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL"
-                )
-                return {hashed: Token(name, scope, created, None) for hashed, name, scope, created in rows}
+                found: list[Any] = connection.cursor().execute(query, values).fetchall()
+                return found
             finally:
                 connection.close()
-        except (DBAPIError, sqlite3.Error) as error:
+        except (DBAPIError, sqlite3.Error, sa.exc.TimeoutError) as error:
             raise StoreError(f"{self.path}: {error}") from error
 
 
@@ -676,8 +751,21 @@ def _engine(path: Path, writer: bool) -> Engine:
     return engine
 
 
-def _compact(tree: Any) -> str:
-    return json.dumps(tree, separators=(",", ":"), allow_nan=False)
+@contextmanager
+def _savepoint(connection: sqlite3.Connection) -> Iterator[None]:
+    """What the block did is undone where it ends badly, as far as there is a transaction left."""
+    connection.execute("SAVEPOINT piece")
+    try:
+        yield
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK TO piece")
+            connection.execute("RELEASE piece")
+        raise
+    connection.execute("RELEASE piece")
+
+
+_compact = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 
 
 def _spoils_all(connection: Connection, error: Exception) -> bool:
@@ -716,6 +804,23 @@ def _record(row: Row[Any]) -> Job:
     )  # fmt: skip
 
 
+def _all_with(t: Transaction, column: str, values: Sequence[Any]) -> list[Job]:
+    """Jobs that have one of the values in the column; SQLite takes some thousands of them."""
+    query = f"SELECT {COLUMNS} FROM jobs WHERE {column} IN ({', '.join('?' * len(values))})"
+    return [_unpacked(dict(zip(NAMES, row, strict=True))) for row in t.ask(query, values)]
+
+
+NAMES = [column.name for column in jobs.c]
+COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
+
+
+def _unpacked(values: dict[str, Any]) -> Job:
+    """A job from what SQLite keeps."""
+    values |= {"state": State(values["state"]), "tags": tuple(json.loads(values["tags"]))}
+    values |= {"retrying": bool(values["retrying"]), "stopping": bool(values["stopping"])}
+    return Job(**{**values, "result": json.loads(values["result"])})
+
+
 def _by_seq(connection: Connection, seq: int) -> Job:
     return _record(connection.execute(sa.select(jobs).where(jobs.c.seq == seq)).one())
 
@@ -748,16 +853,99 @@ def _move(t: Transaction, job: Job, move: Move, message: str | None, **values: A
     return replace(job, state=state, message=message, **values)
 
 
+class _Moves:
+    """Many jobs' moves in a few statements; all set the same columns. A job may come again: it is as it was left."""
+
+    def __init__(self, t: Transaction) -> None:
+        self.transaction, self.now = t, time.time()
+        self.jobs: list[Job] = []
+        self.changes: list[dict[str, Any]] = []
+
+    def add(self, job: Job, move: Move, message: str | None, **values: Any) -> Job:
+        """As `_move` does; to be written by `made`."""
+        change = {"state": after(job.state, move), "message": message, **values}
+        self.changes.append({"seq": job.seq, **change})
+        self.transaction.note("set", job=job.seq, event=self.now, values=change)
+        self.jobs.append(replace(job, **change))
+        return self.jobs[-1]
+
+    def made(self) -> list[Job]:
+        """Write them; the jobs as they are now."""
+        self.transaction.change(jobs, ["seq"], self.changes)
+        told = [{"job": j.seq, "at": self.now, "state": j.state, "message": j.message} for j in self.jobs]
+        self.transaction.add(events, told)
+        return self.jobs
+
+
+def _start(t: Transaction, wanted: Sequence[_Start]) -> list[Job | NotFoundError]:
+    known, moves, rows = _known_jobs(t, [start.job for start in wanted]), _Moves(t), list[dict[str, Any]]()
+    for start in wanted:
+        job = known[start.job]
+        if isinstance(job, Job) and (job.attempt, job.state) == (start.attempt, State.STARTING):
+            rows.append(_of_attempt(t, job, start.process))
+            known[start.job] = moves.add(job, Move.START, None)
+    return _moved(t, rows, moves, [known[start.job] for start in wanted])
+
+
+def _finish(t: Transaction, wanted: Sequence[_End]) -> list[Job | NotFoundError]:
+    known, moves, rows = _known_jobs(t, [each.job for each in wanted]), _Moves(t), list[dict[str, Any]]()
+    results: dict[int, Mapping[str, Any]] = {}
+    for each in wanted:
+        job, end = known[each.job], each.end
+        if not isinstance(job, Job) or job.attempt != end.attempt or not job.state.active:
+            continue
+        broke, move = end.move in (Move.BREAK, Move.LOSE), end.move
+        if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
+            broke, move = False, Move.STOP
+        state, failures = after(job.state, move), job.failures + 1 if broke else 0
+        ended = {"ended": end.ended, "state": state, "message": end.message, "core_seconds": end.core_seconds}
+        rows.append(_of_attempt(t, job, ended))
+        if each.result is not None:
+            results[job.seq] = each.result
+        known[each.job] = moves.add(
+            job, move, end.message, failures=failures, retrying=broke and failures < each.attempts_limit,
+            stopping=False, ended=None if state is State.QUEUED else end.ended,
+            core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
+        )  # fmt: skip
+    _set_results(t, results)
+    return _moved(t, rows, moves, [known[each.job] for each in wanted])
+
+
+def _moved(
+    t: Transaction, rows: Sequence[Mapping[str, Any]], moves: _Moves, answers: "list[Job | NotFoundError]"
+) -> "list[Job | NotFoundError]":
+    t.change(attempts, ["job", "number"], rows)
+    moves.made()
+    return answers
+
+
+def _of_attempt(t: Transaction, job: Job, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The change of a job's present attempt."""
+    row = {"job": job.seq, "number": job.attempt, **values}
+    t.note("attempt", **row)
+    return row
+
+
+def _set_results(t: Transaction, results: Mapping[int, Mapping[str, Any]]) -> None:
+    t.change(jobs, ["seq"], [{"seq": seq, "result": _compact(result)} for seq, result in results.items()])
+
+
+def _known_jobs(t: Transaction, identifiers: Sequence[str]) -> "dict[str, Job | NotFoundError]":
+    """The job of each id or beginning of one."""
+    known: dict[str, Job | NotFoundError] = {job.id: job for job in _all_with(t, "id", identifiers)}
+    for identifier in identifiers:
+        if identifier not in known:
+            try:
+                known[identifier] = _job(t.connection, identifier)
+            except NotFoundError as error:
+                known[identifier] = error
+    return known
+
+
 def _set(t: Transaction, job: Job, event: float | None = None, **values: Any) -> None:
     """Change columns of a job; `event`: when that made an event."""
     t.run(jobs.update().where(jobs.c.seq == job.seq).values(values))
     t.note("set", job=job.seq, event=event, values=values)
-
-
-def _set_attempt(t: Transaction, job: Job, **values: Any) -> None:
-    """Change columns of a job's present attempt."""
-    t.run(attempts.update().where(attempts.c.job == job.seq, attempts.c.number == job.attempt).values(values))
-    t.note("attempt", job=job.seq, number=job.attempt, **values)
 
 
 def _retry(t: Transaction, job: Job) -> Job:
@@ -769,10 +957,10 @@ def _retry(t: Transaction, job: Job) -> Job:
 def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReusedError]:
     """Queue all that no key has brought before: a few statements, however many there are."""
     texts = {f"{key.scope} {key.value}" for submission in wanted if (key := submission.key) is not None}
-    query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
     # by key: the fingerprint of its request, and the job's id or its place among the new ones
     seen: dict[str, tuple[str, str | int]] = {}
     if texts:
+        query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
         seen = {row.key: (row.fingerprint, row.resource) for row in t.run(query)}
     new: list[NewJob] = []
     places: list[str | int | KeyReusedError] = []
@@ -804,11 +992,18 @@ def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReus
     ]  # fmt: skip
 
 
-def _pieces(batch: "Sequence[_Work | _Submission]") -> "list[_Piece]":
-    """What is done in a savepoint each: all submissions at once, everything else by itself."""
-    submissions = [work for work in batch if isinstance(work, _Submission)]
-    pieces: list[_Piece] = [([work], _alone(work)) for work in batch if isinstance(work, _Work)]
-    return [(submissions, lambda t: _submit(t, submissions)), *pieces] if submissions else pieces
+def _pieces(batch: "Sequence[_Work | _Share]") -> "list[_Piece]":
+    """What is done in a savepoint each: first all that is done for many at once, then everything else by itself."""
+    shares: dict[Any, list[_Share]] = {}
+    for work in batch:
+        if isinstance(work, _Share):
+            shares.setdefault(work.effect, []).append(work)
+    together: list[_Piece] = [(share, _shared(share)) for share in shares.values()]
+    return together + [([work], _alone(work)) for work in batch if isinstance(work, _Work)]
+
+
+def _shared(share: Sequence[_Share]) -> "Callable[[Transaction], Sequence[Any]]":
+    return lambda t: share[0].effect(t, [work.wanted for work in share])
 
 
 def _alone(work: _Work) -> "Callable[[Transaction], list[Any]]":
@@ -822,37 +1017,36 @@ def _reused(key: Key) -> KeyReusedError:
 def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
     """Queue jobs. The id is the beginning of the identity, with a number where a case comes again."""
     now, made = time.time(), list[dict[str, Any]]()
-    base = _existing_ids(t.connection, [job.identity for job in new])
+    base = _existing_ids(t, [job.identity for job in new])
     for job in new:
         base[job.identity] = again = base.get(job.identity, 0) + 1
         made.append(
             {"id": job.identity[:16] + (f"-{again}" if again > 1 else ""), "name": job.name, "identity": job.identity,
-             "state": State.QUEUED, "priority": job.priority, "ranks": job.ranks, "tags": list(job.tags),
+             "state": State.QUEUED.value, "priority": job.priority, "ranks": job.ranks, "tags": job.tags,
              "time_limit": job.time_limit, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
              "created": now, "result": {}, "case": job.case}
         )  # fmt: skip
     if not made:
         return []
-    t.run(jobs.insert(), made)
-    last = t.run(sa.select(sa.func.max(jobs.c.seq))).scalar_one()
+    t.add(jobs, [{**row, "tags": _compact(row["tags"]), "result": "{}"} for row in made])
+    [(last,)] = t.ask("SELECT max(seq) FROM jobs")
     numbers = range(last - len(made) + 1, last + 1)
-    t.run(events.insert(), [{"job": seq, "at": now, "state": State.QUEUED} for seq in numbers])
+    t.add(events, [{"job": seq, "at": now, "state": "queued"} for seq in numbers])
     for seq, row in zip(numbers, made, strict=True):
         t.note("job", seq=seq, **row)
     t.durable = True
-    empty = {"message": None, "started": None, "ended": None, "core_seconds": None}
-    return [
-        Job(**{**row, **empty, "seq": seq, "tags": tuple(row["tags"])})
-        for seq, row in zip(numbers, made, strict=True)
-    ]
+    empty = {"message": None, "started": None, "ended": None, "core_seconds": None, "state": State.QUEUED}
+    return [Job(**{**row, **empty, "seq": seq}) for seq, row in zip(numbers, made, strict=True)]
 
 
-def _existing_ids(connection: Connection, which: Sequence[str]) -> dict[str, int]:
+def _existing_ids(t: Transaction, which: Sequence[str]) -> dict[str, int]:
     """How many jobs each identity has had."""
     found: dict[str, int] = {}
     for k in range(0, len(which), 500):
-        part = sa.select(jobs.c.identity, sa.func.count()).where(jobs.c.identity.in_(which[k : k + 500]))
-        found |= {identity: n for identity, n in connection.execute(part.group_by(jobs.c.identity))}
+        part = which[k : k + 500]
+        marks = ", ".join("?" * len(part))
+        query = f"SELECT identity, count(*) FROM jobs WHERE identity IN ({marks}) GROUP BY identity"
+        found |= dict(t.ask(query, part))
     return found
 
 
@@ -905,6 +1099,12 @@ def _sweep(connection: Connection, identifier: str) -> SweepRecord:
     return SweepRecord(
         row.seq, row.id, row.name, row.definition, row.duplicates, row.created, sum(states.values()), states
     )
+
+
+def _change_indices(t: Transaction, key: str, expression: str, gone: Sequence[str]) -> None:
+    for name in gone:
+        t.raw.execute(f'DROP INDEX IF EXISTS "asked_{name}"')
+    t.raw.execute(f'CREATE INDEX IF NOT EXISTS "asked_{key}" ON jobs ({expression})')
 
 
 def _known(t: Transaction, key: Key | None) -> str | None:

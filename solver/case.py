@@ -95,12 +95,14 @@ class Table(BaseModel):
     """A table of the case file. `null` in JSON is the same as leaving the key out.
 
     `owned` has the fields that go with each setting of the `switches`: `...` for one that must be given, else
-    its default. Those that go with another setting only are refused.
+    its default. Those that go with another setting only are refused. `alone` names fields of which the table checks
+    whether they are given, but never their value against another field's.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
     switches: ClassVar[tuple[str, ...]] = ()
     owned: ClassVar[Mapping[tuple[str, ...], Mapping[str, Any]]] = {(): {}}
+    alone: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="wrap")
     @classmethod
@@ -181,6 +183,7 @@ class Nodes(Table):
 
     switches: ClassVar = ("source",)
     owned: ClassVar = {("lattice",): {"spacing": ...}, ("gmsh",): {"spacing": ...}, ("file",): {"path": ...}}
+    alone: ClassVar = ("spacing",)
 
     source: Literal["lattice", "gmsh", "file"] = "lattice"
     """lattice: triangular or body-centred, built in; gmsh: meshed by gmsh; file: read by meshio"""
@@ -198,6 +201,8 @@ class Nodes(Table):
 
 class ShapeFunctions(Table):
     """How fields are interpolated between the nodes; `linear` makes no use of gamma and tolerance."""
+
+    alone: ClassVar = ("kind", "gamma", "tolerance")
 
     kind: Literal["lme", "linear"] = "lme"
     """N_a, eq. (17): local maximum entropy, or linear finite elements on the same mesh"""
@@ -219,6 +224,9 @@ class Particles(Table):
         | {"truncation": None, "histogram": (), "packing_density": None, "count": None, "seed": 0, "container": ...}
         | {"friction": 0.0, "exchange": False},
     }
+    alone: ClassVar = (
+        "mean_radius", "std_radius", "truncation", "packing_density", "count", "seed", "interface_width"
+    )  # fmt: skip
 
     source: Literal["list", "file", "packing"] = "list"
     """list: given here; file: a CSV, read into a list at once; packing: drawn and packed before the run"""
@@ -312,6 +320,11 @@ class Particles(Table):
 class Model(Table):
     """Coefficients; the defaults are those of Table 2."""
 
+    alone: ClassVar = (
+        "A", "B", "L", "kappa_rho", "kappa_eta", "D_vol", "D_vap", "D_surf", "D_gb", "m_t", "m_r", "k", "rho_0", "c",
+        "rigid_motion", "advection",
+    )  # fmt: skip
+
     A: NonNegative = 16.0
     """A [1]: double well A rho^2 (1 - rho)^2, eq. (2)"""
     B: NonNegative = 1.0
@@ -351,6 +364,7 @@ class Time(Table):
 
     switches: ClassVar = ("integrator",)
     owned: ClassVar = {("adaptive",): {"tolerance": 1e-3}, ("rk2",): {"step": None}}
+    alone: ClassVar = ("end", "tolerance", "step")
 
     end: Positive
     """t at the end of the run [1]"""
@@ -364,6 +378,8 @@ class Time(Table):
 
 class Activation(Table):
     """What a run may skip: material points (section 2.4) and order parameters (section 2.5)."""
+
+    alone: ClassVar = ("enabled", "eps_rho", "eps_eta", "few_order_parameters")
 
     enabled: Flag = True
     """switch off material points where both gradients are below their bounds, section 2.4"""
@@ -394,6 +410,7 @@ class Output(Table):
     """When and where to look. What a case file leaves out is filled in by `Case`, from the other tables."""
 
     model_config = ConfigDict(json_schema_extra=lambda schema: schema.update(required=[]))
+    alone: ClassVar = ("history_every", "snapshots", "vacancy_box", "checkpoint_every")
 
     history_every: Positive
     """model time between history rows [1] (default: time.end / 100)"""
@@ -571,13 +588,18 @@ def wrong_dimensions(table: Table, dim: int) -> Iterator[Problem]:
 
 
 def disagreements(case: Case, agreed: bool = False) -> Iterator[Problem]:
-    """What is wrong between tables that are right by themselves; `agreed`: particles and domain are known to fit."""
+    """What is wrong between tables that are right by themselves.
+
+    agreed: particles, domain and boxes are known to fit.
+    """
     if case.particles.source == "list" and not agreed:
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused, not warned of
             found = [*_particles_inside(case), *_particles_apart(case)]
         yield from found
-    for check in (_particles_resolved, _boxes_inside, _times_in_order):
-        yield from check(case)
+    yield from _particles_resolved(case)
+    if not agreed:
+        yield from _boxes_inside(case)
+    yield from _times_in_order(case)
 
 
 def _inner_box(domain: Domain | None, particles: Particles | None) -> Box:

@@ -83,6 +83,8 @@ def test_an_upgraded_index_is_used(old: Path) -> None:
         assert store.sweep("density by spread").states == {"succeeded": 1, "failed": 1, "queued": 1}
         first = store.jobs(limit=9)[-1]
         assert (first.state, first.result["vacancy_ratio"], first.tags) == (State.SUCCEEDED, 0.25, ("a", "b"))
+        tagged = [(job.seq, tag) for job in store.jobs(limit=99) for tag in job.tags]
+        assert sorted((row["job"], row["tag"]) for row in rows(old / "frit.db", "job_tags")) == sorted(tagged)
         assert [number for number, _ in store.history(first.id)] == [0, 1, 2, 3]
         assert done(store.submit(new(1))).seq == 10
         assert set(store.active_tokens()) == {"ab" * 32}

@@ -67,10 +67,17 @@ class LocalBackend:
             await asyncio.sleep(LOOK_AGAIN)
         return record
 
-    async def ended(self, directory: Path, attempt: int) -> Exit | None:
-        """Wait for the end of the attempt's runner; its exit record, None where it left none."""
-        while (lock := try_lock(directory / "runner.lock")) is None:
-            await gone(runner_of(directory, attempt))
+    async def ended(self, directory: Path, attempt: int, pid: int | None = None) -> Exit | None:
+        """Wait for the end of the attempt's runner; its exit record, None where it left none.
+
+        pid: the process that `start` has just told of.
+        """
+        process = None if pid is None else opened(pid)
+        while (lock := try_lock(directory / "runner.lock")) is None:  # it lives, and so the pid was not reused
+            await gone(process or runner_of(directory, attempt))
+            process = None
+        if process is not None:
+            os.close(process)
         os.close(lock)
         return read_exit(directory, attempt)
 
@@ -107,14 +114,20 @@ def runner_of(directory: Path, attempt: int) -> int | None:
     record = read_json(directory / "attempt.json")
     if record.get("attempt") != attempt or record.get("boot") != boot():
         return None
-    try:
-        process = os.pidfd_open(record["pid"])
-    except ProcessLookupError:
+    if (process := opened(record["pid"])) is None:
         return None
     if start_of(record["pid"]) != record["pid_start"]:
         os.close(process)
         return None
     return process
+
+
+def opened(pid: int) -> int | None:
+    """A descriptor of a process, if there is one."""
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        return None
 
 
 async def gone(process: int | None) -> None:

@@ -25,9 +25,11 @@ from soak import of_data
 from frit.service.engine import Engine
 from frit.service.jobs import Job, NewJob, State
 from frit.service.settings import Settings
-from frit.service.store import Store
+from frit.service.store import NewPoint, Store
 from frit.solver.case import parse_case
 from frit.solver.variations import case_text, identity, written
+from frit.sweeps.definition import parse_sweep
+from frit.sweeps.expand import expand
 
 JOBS = 100_000
 POSTS, CONNECTIONS = 5000, 32
@@ -90,6 +92,37 @@ def submissions() -> None:
             server.end()
 
 
+# --- sweeps -----------------------------------------------------------------------------------------------
+
+
+def sweeps() -> None:
+    """A sweep of 10 000 points, expanded and stored."""
+    density, seeds = {"linspace": [0.4, 0.7, 100]}, list(range(100))
+    drawn = {
+        "particles.packing_density": (0.4, 0.7), "particles.mean_radius": (7.0, 9.0), "model.D_surf": (1.0, 8.0),
+        "model.k": (50.0, 150.0), "time.end": (0.5, 2.0),
+    }  # fmt: skip
+    ranges = {key: {"low": low, "high": high} for key, (low, high) in drawn.items()}
+    definitions: dict[str, dict[str, Any]] = {
+        "grid of density and seed": {"axes": {"particles.packing_density": density, "particles.seed": seeds}},
+        "grid of density and k": {"axes": {"particles.packing_density": density, "model.k": {"linspace": [1, 9, 100]}}},
+        "sobol over three tables": {"axes": ranges, "sample": {"method": "sobol", "points": 10_000}},
+    }
+    for name, definition in definitions.items():
+        sweep = parse_sweep({"name": name, "base": PACKING, **definition})
+        for _ in range(3):
+            start = time.perf_counter()
+            expansion = expand(sweep)
+            expanded = time.perf_counter() - start
+            with tempfile.TemporaryDirectory() as folder, closing(Store(Path(folder))) as store:
+                start = time.perf_counter()
+                points = [NewPoint(NewJob(p.case, p.identity, p.name), p.parameters) for p in expansion.points]
+                store.submit_sweep(name, sweep.resolved_json(), points).result()
+                stored = time.perf_counter() - start
+            both = f"expanded {expanded:.2f} s, stored {stored:.2f} s, together {expanded + stored:.2f} s"
+            print(f"{len(points)} points, {name}: {both}")
+
+
 # --- pages ------------------------------------------------------------------------------------------------
 
 
@@ -117,7 +150,10 @@ def pages() -> None:
         "state and result": "state=succeeded&result.vacancy_ratio.le=0.01",
         "order by result": "order=result.vacancy_ratio&state=succeeded",
         "order by radius": "order=-particles.mean_radius",
-        "order by name": "order=name", "tag nobody has": "tag=x", "key without index": "model.k=3",
+        "order by name": "order=name", "tag nobody has": "tag=x", "other key, nobody": "model.k=3",
+        "other key, all": "model.k.ge=3", "other key, none not": "model.k.ne=100", "order by that key": "order=model.k",
+        "order by end": "order=-ended", "order by priority": "order=-priority", "name": "name.ne=x",
+        "two keys": "model.k=3&priority=1", "order, few queued": "order=name&state=failed",
     }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         filled(Path(folder))
@@ -125,10 +161,14 @@ def pages() -> None:
         server.start()
         try:
             with closing(http.client.HTTPConnection("127.0.0.1", server.port)) as connection:
+                for query in queries.values():  # once, so that the indices are made that are missing
+                    connection.request("GET", f"/v1/jobs?{query}")
+                    connection.getresponse().read()
+                httpx2.post(f"{server.url}/v1/jobs", json={"case": PACKING}, timeout=60.0)  # answered after them
                 for name, query in queries.items():
                     times, found = asked(connection, f"/v1/jobs?{query}")
                     middle, worst = times[len(times) // 2] * 1e3, times[-1] * 1e3
-                    print(f"page of {found:2d}, {name:18}{middle:8.1f} ms (worst {worst:.1f})")
+                    print(f"page of {found:2d}, {name:22}{middle:8.1f} ms (worst {worst:.1f})")
         finally:
             server.end()
 
@@ -151,7 +191,7 @@ STAND_IN = """#!/bin/sh
 [ "$1" = --version ] && exit
 for word; do [ "$before" = --out ] && break; before=$word; done
 %s
-printf '{"state": "done"}' > "$word/run.new" && mv "$word/run.new" "$word/run.json"
+printf '{"state": "done"}' > "$word/run.json"
 """
 
 
@@ -202,7 +242,7 @@ def restart(queued: int = 10_000) -> None:
 
 
 BENCHES: dict[str, Callable[[], None]] = {
-    "submissions": submissions, "pages": pages, "no-op": no_op, "restart": restart,
+    "submissions": submissions, "sweeps": sweeps, "pages": pages, "no-op": no_op, "restart": restart,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """From a sweep to its points: axes -> values -> cases, each with the hash that is its identity."""
 
+import gc
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
@@ -64,6 +66,23 @@ def count(sweep: Sweep) -> int:
 
 def expand(sweep: Sweep, limit: int | None = None) -> Expansion:
     """All points. Raises `CaseError` for more than `limit` points, before any is made, and for impossible cases."""
+    with _no_collections():
+        return _expand(sweep, limit)
+
+
+@contextmanager
+def _no_collections() -> Iterator[None]:
+    """The garbage collector rests: nothing of a hundred thousand new objects can be freed, and it would look often."""
+    working = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if working:
+            gc.enable()
+
+
+def _expand(sweep: Sweep, limit: int | None) -> Expansion:
     if limit is not None and (n := count(sweep)) > limit:
         raise CaseError([Problem("axes", None, f"give {n} points, must be at most {limit}")])
     with np.errstate(all="ignore"):  # what overflows is refused with its case

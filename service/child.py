@@ -7,6 +7,7 @@ runner does nothing else.
 import os
 import select
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -29,6 +30,7 @@ class Child:
             become(command, environment, write, first)
         os.close(write)
         self._process, self._words, self._rest = os.pidfd_open(self.pid), read, b""
+        self._handles = threading.Lock()  # a signal comes from any thread, and never after `close`
         self._open = True  # whether anybody holds the pipe
         self._said: deque[str] = deque()  # and not yet passed on
 
@@ -49,7 +51,9 @@ class Child:
                     self._open = False
                     happened.unregister(self._words)
                 *whole, self._rest = (self._rest + data).split(b"\n")
-                self._said.extend(line.decode(errors="replace") for line in (whole if data else [self._rest]))
+                if not data and self._rest:  # the last words had no end
+                    whole = [self._rest]
+                self._said.extend(line.decode(errors="replace") for line in whole)
             elif self._process in ready:
                 happened.unregister(self._process)
                 self.wait()
@@ -62,14 +66,17 @@ class Child:
         return self.returncode
 
     def send(self, number: signal.Signals) -> None:
-        """A signal, if it lives: a reused pid is never hit."""
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._process, number)
+        """A signal, if it lives: a reused pid is never hit, nor a handle that has become another's."""
+        with self._handles, suppress(ProcessLookupError):
+            if self._process >= 0:
+                signal.pidfd_send_signal(self._process, number)
 
     def close(self) -> None:
         """Once it has ended."""
-        os.close(self._words)
-        os.close(self._process)
+        with self._handles:
+            os.close(self._words)
+            os.close(self._process)
+            self._process = -1
 
 
 def become(

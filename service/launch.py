@@ -120,6 +120,7 @@ class Launch:
         self._mark = f"FRIT_LAUNCH={environment['FRIT_LAUNCH']}"
         self.directory, self.stopping, self._adopts = directory, False, adopts
         self._spoken: deque[str] = deque(maxlen=40)
+        self._last_resort: threading.Timer | None = None
         directory.mkdir(parents=True, exist_ok=True)
         self._record_before = stamp(directory / "run.json")
         self._process = Child(command, environment, first)
@@ -132,6 +133,8 @@ class Launch:
             self.kill()
             self._process.wait()
             self._sweep_up()
+        if self._last_resort is not None:
+            self._last_resort.cancel()
         self._process.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
@@ -159,9 +162,9 @@ class Launch:
         if not self.stopping:
             self.stopping = True
             self._process.send(signal.SIGTERM)
-            timer = threading.Timer(grace, self.kill)
-            timer.daemon = True
-            timer.start()
+            self._last_resort = threading.Timer(grace, self.kill)
+            self._last_resort.daemon = True
+            self._last_resort.start()
 
     def kill(self) -> bool:
         """Kill mpirun and whatever carries the mark; true if any did."""

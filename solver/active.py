@@ -17,7 +17,10 @@ from .rigid import rotations
 from .simd import LANES
 from .state import State, width
 
-LEAST = 30.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
+# Points rest only where no more than this part of all must live. A boundary between resting and live points costs, too:
+# what moves at it slowly has to be looked after, and each new choice is a small jolt to the steps in time.
+WORTH = 0.6
+LEAST = 3.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Active:
 
     def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
         """Largest movement of a watched value, in units of its eps; `run.LAG` says when it is too much."""
-        slot = 0.04 * LEAST * eps_eta
+        slot = 0.3 * eps_eta
         return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta, slot))
 
 
@@ -53,6 +56,8 @@ def activate(d: Discretisation, state: State) -> Active:
     not depend on the number of ranks.
     """
     flags, owner = _settle(d, state)
+    if not _worth(d, flags):
+        flags[:] = 1
     table = d.shape
     low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
     high = np.full(d.nodes, -1, dtype=np.int64)
@@ -91,6 +96,12 @@ def activate(d: Discretisation, state: State) -> Active:
         watched=np.flatnonzero(moving & (watch != 0)),
         watch=watch,
     )
+
+
+def _worth(d: Discretisation, flags: Numbers) -> bool:
+    """Whether so many points of all ranks can rest that resting pays. Collective."""
+    counts = d.share.ranks.sum(np.array([flags.sum(), flags.size], dtype=np.float64))
+    return bool(counts[0] <= WORTH * counts[1])
 
 
 def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:

@@ -12,15 +12,14 @@ import numpy as np
 
 from . import kernels, slots
 from .arrays import Flags, Floats, Integers, Numbers
-from .discretisation import Discretisation
+from .discretisation import WORTH, Discretisation
 from .rigid import rotations
 from .simd import LANES
 from .state import State, width
 
-# Points rest only where no more than this part of all must live. A boundary between resting and live points costs, too:
-# what moves at it slowly has to be looked after, and each new choice is a small jolt to the steps in time.
-WORTH = 0.6
+NEAR = 1e-3  # nodes with a smaller N_a(x_p) do not decide who shares a slot: what they bring is below eps
 LEAST = 3.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
+SLOT_EPS = 0.3  # eps_eta: unit in which an order parameter's growth is measured where it does not exist yet
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Active:
 
     def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
         """Largest movement of a watched value, in units of its eps; `run.LAG` says when it is too much."""
-        slot = 0.3 * eps_eta
+        slot = SLOT_EPS * eps_eta
         return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta, slot))
 
 
@@ -148,7 +147,8 @@ def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> 
     """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot."""
     claims = np.full_like(state.owner, -1)
     crowded = np.empty_like(clash)
-    kernels.claim(claims, crowded, owner, d.shape.offsets, d.shape.nodes)
+    table = d.shape
+    kernels.claim(claims, crowded, owner, NEAR, table.offsets, table.nodes, table.rows, table.table)
     mine = claims.copy()
     d.share.halo.most(claims)
     torn = (mine >= 0) & (mine != claims)
@@ -161,7 +161,7 @@ def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]
     owner = np.empty((table.points, state.owner.shape[1]), dtype=np.int32)
     clash = np.empty((table.points, 2), dtype=np.int64)
     kernels.sense(
-        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, LEAST * switch.eps_eta, d.dim,
+        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, LEAST * switch.eps_eta, NEAR, d.dim,
         table.offsets, table.nodes, table.rows, table.table,
     )
     return flags, owner, clash

@@ -13,6 +13,10 @@ from .neighbours import Grid
 from .partition import Halo, Ranks, Share, bisect
 from .shape import ShapeError, ShapeTable, linear, lme
 
+# Points rest only where no more than this part of all must live. A boundary between resting and live points costs, too:
+# what moves at it slowly has to be looked after, and each new choice is a small jolt to the steps in time.
+WORTH = 0.6
+
 
 @dataclass(frozen=True)
 class Discretisation:
@@ -93,7 +97,10 @@ def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:
 
 
 def activity(mesh: Mesh, u: Floats, eps: float) -> Floats:
-    """Expected work of each point (p,): 1 where a field varies over its cell by more than eps per nm, else 0.05."""
+    """Expected work of each point (p,): 1 where a field varies over its cell by more than eps per nm, else 0.05.
+
+    Where resting does not pay (`WORTH`) all points live.
+    """
     varies = np.zeros(len(mesh.cells), dtype=bool)
     kernels.variation(varies, mesh.cells, u, eps * mesh.spacing)
-    return np.where(varies, 1.0, 0.05)
+    return np.where(varies | (varies.mean() > WORTH), 1.0, 0.05)

@@ -172,6 +172,8 @@ def touching_share(point: Floats, row: int, i: int, j: int, w: float, dim: int, 
     contact force then follows it without jumps; as the cells shrink, it becomes the bracket of (6).
     """
     product = point[row, i] * point[row, j]
+    if abs(product - c) >= 0.5 * c:  # no cell counts as larger than that
+        return 1.0 if product > c else 0.0
     square = 0.0
     for k in range(1, 1 + dim):
         slope = point[row, i] * point[row + k, j] + point[row, j] * point[row + k, i]
@@ -383,13 +385,13 @@ def free_energy(
 @jit
 def sense(
     flags: Numbers, owner: Numbers, clash: Integers, u: Floats, node_owner: Numbers,
-    eps_rho: float, eps_eta: float, least: float, dim: int,
+    eps_rho: float, eps_eta: float, least: float, near: float, dim: int,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
 ) -> None:
     """Mark the points where something happens and name the particles that their slots mean (section 2.4).
 
     flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s] is the particle found in slot s
-    of the point's nodes, if its eta or |grad eta| is at least `least` here; where there are two,
+    of the point's nodes with N_a(x_p) >= near, if its eta or |grad eta| is at least `least` here; where there are two,
     clash[p] = (one, other).
     """
     point = np.empty((1 + dim, u.shape[1]))
@@ -404,8 +406,10 @@ def sense(
                 flags[p] = 1
             if not steep(point, 1 + s, least) and abs(point[0, 1 + s]) < least:
                 continue
-            for e in range(offsets[p], offsets[p + 1]):
-                a = node_owner[nodes[e], s]
+            for i in range(offsets[p + 1] - offsets[p]):
+                if table[0, rows[p] + i] < near:
+                    continue
+                a = node_owner[nodes[offsets[p] + i], s]
                 b = owner[p, s]
                 if a >= 0 and b >= 0 and a != b:
                     clash[p, 0] = min(a, b)
@@ -423,10 +427,13 @@ def steep(point: Floats, column: int, eps: float) -> bool:
 
 
 @jit
-def claim(node_owner: Numbers, clash: Integers, owner: Numbers, offsets: Integers, nodes: Numbers) -> None:
+def claim(
+    node_owner: Numbers, clash: Integers, owner: Numbers, near: float,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+) -> None:
     """Let the particles claim the nodes of every point at which they exist: where they are, and a ring to grow into.
 
-    Where a node's slot is already another particle's, clash[p] = (one, other).
+    Nodes with N_a(x_p) < near do not count. Where a node's slot is already another particle's, clash[p] = (one, other).
     """
     for p in range(owner.shape[0]):
         clash[p, 0] = -1
@@ -434,10 +441,13 @@ def claim(node_owner: Numbers, clash: Integers, owner: Numbers, offsets: Integer
             a = owner[p, s]
             if a < 0:
                 continue
-            for e in range(offsets[p], offsets[p + 1]):
-                holder = node_owner[nodes[e], s]
+            for i in range(offsets[p + 1] - offsets[p]):
+                if table[0, rows[p] + i] < near:
+                    continue
+                node = nodes[offsets[p] + i]
+                holder = node_owner[node, s]
                 if holder < 0:
-                    node_owner[nodes[e], s] = a
+                    node_owner[node, s] = a
                 elif holder != a:
                     clash[p, 0] = min(a, holder)
                     clash[p, 1] = max(a, holder)

@@ -1,6 +1,6 @@
 # make run    set up everything, sinter the three packs of sweeps/quick.toml, end with a table and their curves
 # make pack   the same with one pack on 2 ranks, with pictures
-# make test   set up everything and run the tests       (make slow: the long ones; make lint; make bench)
+# make test   set up everything and run the tests       (make slow: the long ones; make lint; make bench; make bench-paper)
 
 PYTHON ?= python3
 VENV := .venv
@@ -15,7 +15,7 @@ DATA ?= runs/data
 FILES := $(sort $(shell find solver service sweeps -name '*.py'))
 LISTED := $(VENV)/.files-$(shell echo "$(FILES)" | cksum | cut -d' ' -f1)
 
-.PHONY: run pack test slow lint bench setup clean
+.PHONY: run pack test slow lint bench bench-paper setup clean
 
 run: setup
 	$(BIN)/frit sweep plan $(SWEEP) --data $(DATA)
@@ -46,6 +46,9 @@ lint: setup
 
 bench: setup
 	$(BIN)/python tests/benchmarks/bench.py
+
+bench-paper: setup
+	$(BIN)/python tests/benchmarks/bench_paper.py
 
 setup: $(LISTED)
 

@@ -207,9 +207,9 @@ class Chebyshev:
         self.tau = max(self.least_tau, THETA * dt)
         scheme.rates(state.u, self.rate_1, self.tau)
         state.evaluations += stages
-        sums = np.array([0.0, float(scheme.d.mass[scheme.active.owned].sum())])
-        sums[0] = kernels.chebyshev_error(
-            state.u, self.old, self.rate_1, self.rate_0, dt, scheme.d.mass, self.tolerance, scheme.active.owned
+        sums = np.empty(2)
+        kernels.chebyshev_error(
+            sums, state.u, self.old, self.rate_1, self.rate_0, dt, scheme.d.mass, self.tolerance, scheme.active.owned
         )
         scheme.d.share.ranks.sum(sums)
         return float(np.sqrt(sums[0] / sums[1])) if sums[1] > 0.0 else 0.0

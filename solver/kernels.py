@@ -685,6 +685,13 @@ def divide(array: Floats, mass: Floats, listed: Integers) -> None:
 
 
 @jit
+def divide_values(array: Floats, mass: Floats, listed: Integers) -> None:
+    """array[a] /= m_a at the listed nodes, one value each."""
+    for i in range(listed.size):
+        array[listed[i]] /= mass[listed[i]]
+
+
+@jit
 def advance(new: Floats, old: Floats, dt: float, rate: Floats, listed: Integers) -> None:
     """new = old + dt rate at the listed nodes."""
     for i in range(listed.size):
@@ -737,11 +744,14 @@ def chebyshev_stage(
 
 @jit
 def chebyshev_error(
-    new: Floats, old: Floats, rate_1: Floats, rate_0: Floats, dt: float,
+    sums: Floats, new: Floats, old: Floats, rate_1: Floats, rate_0: Floats, dt: float,
     mass: Floats, tolerance: float, listed: Integers,
-) -> float:
-    """sum_a m_a sum_fields (e / (tolerance (1 + |u|)))^2, e = 0.8 (y_n - y_{n+1}) + 0.4 dt (F_n + F_{n+1})."""
-    total = 0.0
+) -> None:
+    """sums = sum_a m_a sum_fields (e / (tolerance (1 + |u|)))^2 and sum_a m_a over the listed nodes;
+
+    e = 0.8 (y_n - y_{n+1}) + 0.4 dt (F_n + F_{n+1}).
+    """
+    sums[:] = 0.0
     for i in range(listed.size):
         a = listed[i]
         square = 0.0
@@ -749,8 +759,8 @@ def chebyshev_error(
             error = 0.8 * (old[a, c] - new[a, c]) + 0.4 * dt * (rate_0[a, c] + rate_1[a, c])
             error /= tolerance * (1.0 + abs(new[a, c]))
             square += error * error
-        total += mass[a] * square
-    return total
+        sums[0] += mass[a] * square
+        sums[1] += mass[a]
 
 
 @jit

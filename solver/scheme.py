@@ -61,7 +61,7 @@ class Scheme:
         #   W_a = 1/m_a sum_p w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]
         self._gather(u)
         d.share.halo.add(self.W)
-        self.W[a.nodes] /= d.mass[a.nodes]
+        kernels.divide_values(self.W, d.mass, a.nodes)
 
         # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
         watch.enter("rigid motion")

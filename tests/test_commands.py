@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 from launching import PAIR, TIMEOUT, different, history, interrupted, record
 
+from frit.solver.profile import PHASES
+
 # On a terminal it becomes that of its session, as a shell's would be.
 FRIT = """
 import fcntl, os, termios
@@ -107,6 +109,26 @@ def test_run_ends_with_a_summary_and_nothing_else(folder: Path) -> None:
     assert said.count(f"{rows[0]['vacancy_ratio']:.6g} -> {rows[-1]['vacancy_ratio']:.6g}") == 1
     assert "\x1b" not in said
     assert record(folder / "runs/pair")["name"] == "a pair"
+
+
+def test_profile_tells_where_the_time_of_each_rank_went(folder: Path) -> None:
+    """Every phase has its line and every rank its column; together they are no more than the wall's seconds."""
+    began = time.monotonic()
+    status, out, err = frit(folder, "run", "pair.toml", "--ranks", "2", "--out", "runs/profiled", "--profile")
+    wall = time.monotonic() - began
+    assert (status, err) == (0, "")
+    table = out.split("\n\n")[1].splitlines()
+    assert table[0].split() == ["seconds", "rank", "0", "rank", "1", "share"]
+    ranks = record(folder / "runs/profiled")["profile"]
+    assert len(ranks) == 2
+    for phase in (*PHASES, "memory, GB"):
+        (line,) = (line for line in table if line.startswith(phase))
+        shown = line.removeprefix(phase).split()[:2]
+        key = phase.removesuffix(", GB")
+        assert [float(value) for value in shown] == pytest.approx([rank[key] for rank in ranks], abs=0.0051)
+        assert all(rank[key] > 0.0 for rank in ranks)
+    for rank in ranks:
+        assert sum(rank.values()) - rank["memory"] <= wall
 
 
 def test_plots_of_a_real_run(folder: Path) -> None:

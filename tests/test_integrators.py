@@ -1,5 +1,6 @@
 """Steps in time: what one step is, how errors fall with it, where it is stable, and the values in between."""
 
+import tracemalloc
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -364,3 +365,28 @@ def test_values_between_steps_are_as_good_as_the_steps() -> None:
             got = integrator.at(problem, state, float(time))[:, 0]
             np.testing.assert_allclose(got[:8], (VALUES / (1 + VALUES * time))[:8], rtol=0, atol=1e-3)
             np.testing.assert_array_equal(got[8:], VALUES[8:])
+
+
+def test_steps_allocate_nothing_that_grows_with_the_mesh(ranks: Ranks) -> None:
+    """Once its arrays are there, a step takes less new memory than one value per node: lists, views, the few numbers of
+    each particle and its contacts."""
+    case = parse_case({
+        "domain": {"size": [60.0, 40.0]},
+        "nodes": {"spacing": 0.4},
+        "particles": {"centres": [[20.0, 20.0], [40.0, 20.0]], "radii": [10.0, 10.0]},
+        "time": {"end": 1.0},
+    })  # fmt: skip
+    mesh = build_mesh(case, ranks)
+    scheme, state = prepare(case, mesh, ranks)
+    integrator = make_integrator(case, mesh)
+    integrator.restart(scheme, state)
+    for _ in range(2):
+        integrator.step(scheme, state, 1.0)
+    tracemalloc.start()
+    try:
+        integrator.step(scheme, state, 1.0)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    print(most, state.u[:, 0].nbytes)
+    assert most < 0.5 * state.u[:, 0].nbytes

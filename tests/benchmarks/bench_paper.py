@@ -1,0 +1,166 @@
+"""The bars that frit sets itself, measured: `make bench-paper`, or `python tests/benchmarks/bench_paper.py [NAME ...]`.
+
+Runs are whole commands, `frit run CASE --ranks 2`, so that start, set-up and output count; the two-disc cases, whose
+bar is one core's time loop, run in this process. `packs-3d` takes the better part of an hour and runs only when named.
+The output is a table in Markdown for RESULTS.md.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench import Silent, two_discs
+
+from frit.solver.case import Case, load_case, parse_case
+from frit.solver.neck import Neck
+from frit.solver.partition import Ranks
+from frit.solver.prepare import build_mesh, make_integrator, prepare
+from frit.solver.run import run
+from frit.solver.state import State
+
+PAPER = Path(__file__).parents[2] / "sweeps" / "paper"
+OFF = {"enabled": False, "few_order_parameters": False}
+ADAPTIVE = {"end": 10.0, "integrator": "adaptive"}
+NECK = 17.33  # nm at t = 10, converged differences
+
+
+class Loop:
+    """A case run in this process on one core: seconds of the time loop, and what came out."""
+
+    def __init__(self, case: Case) -> None:
+        mesh = build_mesh(case, Ranks())
+        scheme, self.state = prepare(case, mesh, Ranks())
+        began = time.process_time()
+        run(scheme, self.state, make_integrator(case, mesh), Silent())
+        self.seconds = time.process_time() - began
+        self.evaluations = self.state.evaluations
+        self.live = scheme.active.live.size / scheme.d.weights.size
+        self.neck = Neck(case, mesh).measure(fields(self.state)) if len(self.state.slot_of) == 2 else np.nan
+        moments = scheme.d.first_moment.T @ fields(self.state)[:, 1:] / (scheme.d.mass @ fields(self.state)[:, 1:])
+        self.distance = float(np.linalg.norm(moments[:, 1] - moments[:, 0])) if moments.shape[1] == 2 else np.nan
+
+
+def fields(state: State) -> Any:
+    """rho and the order parameters in the order of the particles, (n, 1 + particles)."""
+    return state.u[:, [0, *(1 + state.slot_of)]]
+
+
+class Command:
+    """`frit run` of a case: wall seconds from start to end, and its records."""
+
+    def __init__(self, case: Case, ranks: int = 2) -> None:
+        with tempfile.TemporaryDirectory(prefix="frit-bench-") as folder:
+            file, out = Path(folder) / "case.json", Path(folder) / "run"
+            file.write_text(case.resolved_json())
+            began = time.monotonic()
+            frit = Path(sys.executable).with_name("frit")
+            command = [str(frit), "run", str(file), "--ranks", str(ranks), "--out", str(out)]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            self.seconds = time.monotonic() - began
+            self.history = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
+            self.profile: list[dict[str, float]] = json.loads((out / "run.json").read_text())["profile"]
+        self.memory = sum(rank["memory"] for rank in self.profile)
+        self.evaluations = self.history[-1]["evaluations"]
+        self.live = self.history[-1]["live_fraction"]
+
+    def column(self, name: str) -> Any:
+        """One column of the history."""
+        return np.array([row[name] for row in self.history])
+
+
+def row(name: str, bar: str, found: str, loop: Loop | Command) -> str:
+    """A line of the table."""
+    memory = f"{loop.memory:.2f}" if isinstance(loop, Command) else ""
+    return f"| {name} | {bar} | {found} | {loop.evaluations} | {loop.seconds:.2f} | {loop.live:.2f} | {memory} |"
+
+
+def discs() -> Iterator[str]:
+    """Two discs without rigid motion."""
+    Loop(two_discs(end=0.1))  # compiled, or read from disk
+    loops = sorted((Loop(two_discs(time=ADAPTIVE)) for _ in range(5)), key=lambda loop: loop.seconds)
+    error = loops[2].neck / NECK - 1.0
+    yield row("two discs, no motion, t = 10", "neck 1 %, 0.8 s", f"neck {error:+.2%}, median of 5 runs", loops[2])
+
+
+def motion() -> Iterator[str]:
+    """Two discs with rigid motion, against `rk2` at a tenth of its stable step."""
+    resting = Loop(two_discs(time=ADAPTIVE))
+    moving = Loop(two_discs(time=ADAPTIVE, model={"rigid_motion": True}))
+    fine = Loop(two_discs(time={"end": 10.0, "integrator": "rk2", "step": 1e-4}, model={"rigid_motion": True}))
+    ratio = moving.evaluations / resting.evaluations
+    errors = f"neck {moving.neck / fine.neck - 1.0:+.3%}, distance {moving.distance / fine.distance - 1.0:+.3%}"
+    yield row("the same with motion", "3 x evaluations; 0.3 %", f"{ratio:.2f} x; {errors}", moving)
+    yield row("  rk2 at step 1e-4", "", "", fine)
+
+
+def pack(**changes: Any) -> Case:
+    """The paper's 2-D pack to t = 5."""
+    tree = load_case(PAPER / "pack2d.toml").tree()
+    tree["time"] |= {"end": 5.0}
+    tree["output"] |= {"snapshots": [5.0], "history_every": 0.5}
+    return parse_case(tree | changes)
+
+
+def pack_2d() -> Iterator[str]:
+    """The 2-D pack, and the same with both efficiency schemes off."""
+    Command(pack(time={"end": 0.01}, output={"history_every": 0.01}))  # compiled, and packed
+    on, off = Command(pack()), Command(pack(activation=OFF))
+    yield row("2-D pack, t = 5, 2 ranks", "30 s", "", on)
+    difference = np.abs(on.column("vacancy_ratio") - off.column("vacancy_ratio")).max()
+    found = f"{off.seconds / on.seconds:.1f} x slower, vacancy ratio differs by {difference:.1e}"
+    yield row("  both schemes off", "10 x slower; 2e-4", found, off)
+
+
+def packs_3d() -> Iterator[str]:
+    """The paper's pack A to t = 15."""
+    tree = load_case(PAPER / "pack_a.toml").tree()
+    tree["time"] |= {"end": 15.0}
+    tree["output"] |= {"snapshots": [15.0], "history_every": 0.5}
+    found = Command(parse_case(tree))
+    history = ", ".join(f"{r:.4f}" for r in found.column("vacancy_ratio"))
+    yield row("3-D pack A, t = 15, 2 ranks", "45 min, 12 GB", f"vacancy ratios {history}", found)
+
+
+def spacings() -> Iterator[str]:
+    """Evaluations over the spacing, 2-D, without rigid motion."""
+    counts = []
+    for spacing in (2.0, 1.0, 0.5):
+        loop = Loop(two_discs(nodes={"spacing": spacing}, time={"end": 10.0, "integrator": "adaptive"}))
+        counts.append(loop.evaluations)
+        yield row(f"two discs, spacing {spacing}", "", f"neck {loop.neck:.3f}", loop)
+    slopes = [np.log2(b / a) for a, b in pairwise(counts)]
+    yield f"| evaluations over h | no faster than h^-2 | h^{-slopes[0]:.2f}, h^{-slopes[1]:.2f} | | | | |"
+
+
+def ranks() -> Iterator[str]:
+    """The 2-D pack on one rank and on two: the time loop without set-up and output, the better of two runs each."""
+    phases = ("gather", "scatter", "halo", "rigid motion", "live points", "steps")
+    best = {1: np.inf, 2: np.inf}
+    for count in (1, 2, 1, 2):
+        found = Command(pack(time={"end": 0.3}, output={"history_every": 0.3}), count)
+        best[count] = min(best[count], max(sum(rank[phase] for phase in phases) for rank in found.profile))
+    yield f"| 2-D pack, 1 -> 2 ranks | 1.8 x | {best[1] / best[2]:.2f} x | | {best[2]:.2f} | | |"
+
+
+CASES: dict[str, Callable[[], Iterator[str]]] = {
+    "discs": discs, "spacings": spacings, "ranks": ranks, "pack-2d": pack_2d, "motion": motion, "packs-3d": packs_3d,
+}  # fmt: skip
+
+
+def main() -> None:
+    """The table, line by line as it comes."""
+    print("| case | bar | found | evaluations | seconds | live | memory, GB |\n|---|---|---|---|---|---|---|")
+    for name in sys.argv[1:] or [name for name in CASES if name != "packs-3d"]:
+        for line in CASES[name]():
+            print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

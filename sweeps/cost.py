@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from frit.solver.arrays import Floats
 
 from .expand import Expansion
+from .scaling import efficiencies
 
 START = 3.0  # s: command, interpreter, imports, compiled kernels from disk
 SET_UP = 2.0e-7  # s per point and node in range: mesh, neighbours, shape functions
@@ -234,6 +235,8 @@ class Plan:
     """what these will take, summed over their ranks"""
     source: str
     """what the hours rest on: "past runs", "cost model", or how many of each"""
+    busy: dict[str, float]
+    """ranks, and the part of their time that is work, for the costliest of the missing cases"""
 
     def rows(self) -> list[tuple[str, str]]:
         """The plan as a table of words and figures."""
@@ -244,6 +247,7 @@ class Plan:
             ("already done", f"{self.done}"),
             ("to run", f"{self.to_run}"),
             ("core-hours", hours),
+            ("ranks kept busy", ", ".join(f"{ranks}: {part:.0%}" for ranks, part in self.busy.items()) or "-"),
         ]
 
     def as_dict(self) -> dict[str, Any]:
@@ -251,15 +255,29 @@ class Plan:
         return asdict(self)
 
 
+def busy(case: Case) -> dict[str, float]:
+    """Ranks, and the part of their time that is work, for a resolved case; see `scaling`."""
+    said, size = work(case), tuple(case["domain"]["size"])
+    nodes = said.points / (2 if len(size) == 2 else 6)  # of the built-in lattices
+    shape = case["shape_functions"]
+    reach = 1.0 if shape["kind"] == "linear" else sqrt(-log(shape["tolerance"]) / shape["gamma"])
+    seconds = said.points * said.live * said.nodes * VISIT
+    found = efficiencies(size, nodes, reach * _spacing(case), seconds, _particles(case["particles"], len(size)))
+    return {str(ranks): part for ranks, part in found.items()}
+
+
 def plan(expansion: Expansion, past: Sequence[Measured] = (), done: Collection[str] = ()) -> Plan:
     """The plan of an expanded sweep; `done` are the identities of cases that need not be computed."""
     missing = [point for point in expansion.points if point.identity not in done]
     experience = Experience(past)
-    guesses = [experience.estimate(json.loads(point.case)) for point in missing]
+    cases = [json.loads(point.case) for point in missing]
+    guesses = [experience.estimate(case) for case in cases]
     known = sum(guess.source == "past runs" for guess in guesses)
     mixed = f"past runs for {known}, cost model for the rest"
     source = {len(guesses): "past runs", 0: "cost model"}.get(known, mixed)
+    costliest = max(zip(guesses, cases, strict=True), key=lambda pair: pair[0].core_seconds, default=None)
     return Plan(
+        busy=busy(costliest[1]) if costliest else {},
         points=len(expansion.points),
         duplicates=expansion.duplicates,
         done=len(expansion.points) - len(missing),

@@ -1,4 +1,4 @@
-"""More ranks than there are here: pack A of the paper cut for 2 ... 512 ranks, `python tests/benchmarks/bench_ranks.py`.
+"""More ranks than are here: pack A of the paper cut for 2 ... 512 ranks, `python tests/benchmarks/bench_ranks.py`.
 
 The partitions are real, all neighbour lists included; what ranks would take is reckoned with the latency and the
 bandwidth of `frit.sweeps.scaling`, beside what `frit sweep plan` says without a mesh. Some minutes and 6 GB.

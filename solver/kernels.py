@@ -675,13 +675,12 @@ def clear(array: Floats, listed: Integers) -> None:
 
 
 @jit
-def divide(array: Floats, mass: Floats, listed: Integers) -> None:
-    """array[a, :] /= m_a at the listed nodes."""
+def scale(array: Floats, factors: Floats, listed: Integers) -> None:
+    """array[a, :] *= factors[a, :] at the listed nodes."""
     for i in range(listed.size):
         a = listed[i]
-        inverse = 1.0 / mass[a]
         for column in range(0, array.shape[1], LANES):
-            store(array, a, column, inverse * load(array, a, column))
+            store(array, a, column, load(factors, a, column) * load(array, a, column))
 
 
 @jit

@@ -36,6 +36,10 @@ class Scheme:
         points = self.active.live.size
         self.slot_of, self.node_owner = state.slot_of, state.owner
         self.W = np.zeros(self.d.nodes)
+        self.inverse_mass = np.zeros_like(state.u)  # 1 / m_a; 0 in slots that no particle has at the node
+        self.inverse_mass[:, 0] = 1.0
+        self.inverse_mass[:, 1 : 1 + state.owner.shape[1]] = state.owner >= 0
+        self.inverse_mass /= self.d.mass[:, None]
         self.D, self.S2 = np.empty((2, points))
         self.touching, self.touches = np.empty(points, dtype=np.int64), 0
         self.point = np.zeros((points * (1 + self.d.dim), state.u.shape[1]))
@@ -86,7 +90,7 @@ class Scheme:
         if moving:
             kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
         d.share.halo.add(rate)
-        kernels.divide(rate, d.mass, a.nodes)
+        kernels.scale(rate, self.inverse_mass, a.nodes)
         watch.enter(before)
 
     def _stiffness(self) -> Floats:

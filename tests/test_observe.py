@@ -206,6 +206,7 @@ def test_sums_of_uniform_fields(ranks: Ranks) -> None:
 
 def test_still_points_are_not_live(ranks: Ranks) -> None:
     case, _, _ = pair(2, gap=0.5)
+    case["domain"] = {"size": [46.0, 38.0]}
     parsed = parse_case(case)
     scheme, _ = prepare(parsed, build_mesh(parsed, ranks), ranks)
     measured = row(case, ranks)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import reference
 
-from frit.solver import kernels
+from frit.solver import active, kernels
 from frit.solver.arrays import Floats
 from frit.solver.case import Case, parse_case
 from frit.solver.geometry import Mesh
@@ -280,6 +280,13 @@ def velocity(motion: Floats, x: Floats) -> Floats:
 
 
 # --- switching off
+
+
+@pytest.fixture(autouse=True)
+def every_point_rests_that_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where so many live that it does not pay."""
+    monkeypatch.setattr(active, "WORTH", 1.0)
+
 
 EPS = [1e-5, 1e-7]
 

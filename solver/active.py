@@ -62,9 +62,7 @@ def activate(d: Discretisation, state: State) -> Active:
     high = np.full(d.nodes, -1, dtype=np.int64)
     kernels.interiors(low, high, flags, owner, state.u, table.offsets, table.nodes, table.rows, table.table)
     _spread(d, low, high)
-    mixed = low < high
-    if mixed.any():
-        kernels.switch_on(flags, mixed, table.offsets, table.nodes)
+    kernels.switch_on(flags, low < high, table.offsets, table.nodes)
     live = np.flatnonzero(flags)
     mask = np.zeros((live.size, state.u.shape[1]))
     mask[:, 0] = 1.0

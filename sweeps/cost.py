@@ -34,7 +34,7 @@ STIFF = 0.1  # more stages per step, but steps are as long as accuracy allows on
 GROWTH = 0.5  # steps get longer as interfaces come to rest
 CONTACTS = 0.6  # contacts that form and shift shorten the steps: per root of the number of other particles
 TOLERANCE = 1 / 6, 0.3  # power of 1 / tolerance without and with contacts
-RESTING = 0.6  # points rest where no more than this part of all has to live
+RESTING = 0.6  # points rest where no more than this part of all has to live: `WORTH` of solver/discretisation.py
 SIMILAR = 5  # past runs that a guess rests on
 FAR = 2.0  # in logarithms of the work's parts: runs farther away say little
 
@@ -62,7 +62,11 @@ class Work:
     def core_seconds(self) -> float:
         """On one core, from start to end."""
         set_up = START + self.points * self.nodes * SET_UP + self.rows * (ROW + ROW_POINT * self.points)
-        return set_up + self.points * self.live * self.nodes * self.evaluations * VISIT
+        return set_up + self.evaluations * self.evaluation()
+
+    def evaluation(self) -> float:
+        """Seconds of one evaluation of the rates on one core."""
+        return self.points * self.live * self.nodes * VISIT
 
 
 def work(case: Case) -> Work:
@@ -108,11 +112,15 @@ def _spacing(case: Case) -> float:
 
 def _nodes(case: Case) -> float:
     """Nodes within h sqrt(-ln(delta_0) / gamma) of a point; the corners of a cell with linear functions."""
-    dim, shape = len(case["domain"]["size"]), case["shape_functions"]
-    if shape["kind"] == "linear":
+    dim, reach = len(case["domain"]["size"]), _reach(case["shape_functions"])
+    if case["shape_functions"]["kind"] == "linear":
         return dim + 1.0
-    reach = sqrt(-log(shape["tolerance"]) / shape["gamma"])
     return pi * reach**2 * 2 / sqrt(3) if dim == 2 else 4 / 3 * pi * reach**3 * 0.75 * sqrt(3)
+
+
+def _reach(shape: Case) -> float:
+    """Range of the shape functions over h; one cell for linear ones."""
+    return 1.0 if shape["kind"] == "linear" else sqrt(-log(shape["tolerance"]) / shape["gamma"])
 
 
 def _live(case: Case) -> float:
@@ -259,10 +267,8 @@ def busy(case: Case) -> dict[str, float]:
     """Ranks, and the part of their time that is work, for a resolved case; see `scaling`."""
     said, size = work(case), tuple(case["domain"]["size"])
     nodes = said.points / (2 if len(size) == 2 else 6)  # of the built-in lattices
-    shape = case["shape_functions"]
-    reach = 1.0 if shape["kind"] == "linear" else sqrt(-log(shape["tolerance"]) / shape["gamma"])
-    seconds = said.points * said.live * said.nodes * VISIT
-    found = efficiencies(size, nodes, reach * _spacing(case), seconds, _particles(case["particles"], len(size)))
+    reach, particles = _reach(case["shape_functions"]) * _spacing(case), _particles(case["particles"], len(size))
+    found = efficiencies(size, nodes, reach, said.evaluation(), particles)
     return {str(ranks): part for ranks, part in found.items()}
 
 

@@ -20,10 +20,12 @@ import numpy as np
 
 from frit.solver.case import Case, parse_case
 from frit.solver.geometry import lattice
+from frit.solver.neck import Neck
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
 from frit.solver.run import run
 from frit.solver.shape import lme
+from frit.solver.state import State
 
 
 class Silent:
@@ -53,14 +55,25 @@ def two_discs(end: float = 10.0, **changes: dict[str, Any]) -> Case:
     return parse_case({**tree, **changes})
 
 
-def time_loop(case: Case) -> tuple[float, int]:
-    """Processor seconds of the time loop, and evaluations."""
-    mesh = build_mesh(case, Ranks())
-    scheme, state = prepare(case, mesh, Ranks())
-    integrator = make_integrator(case, mesh)
-    began = time.process_time()
-    run(scheme, state, integrator, Silent())
-    return time.process_time() - began, state.evaluations
+class Loop:
+    """A case run in this process on one core: seconds of the time loop, and what came out."""
+
+    def __init__(self, case: Case) -> None:
+        mesh = build_mesh(case, Ranks())
+        scheme, self.state = prepare(case, mesh, Ranks())
+        began = time.process_time()
+        run(scheme, self.state, make_integrator(case, mesh), Silent())
+        self.seconds = time.process_time() - began
+        self.evaluations = self.state.evaluations
+        self.live = scheme.active.live.size / scheme.d.weights.size
+        self.neck = Neck(case, mesh).measure(fields(self.state)) if len(self.state.slot_of) == 2 else np.nan
+        moments = scheme.d.first_moment.T @ fields(self.state)[:, 1:] / (scheme.d.mass @ fields(self.state)[:, 1:])
+        self.distance = float(np.linalg.norm(moments[:, 1] - moments[:, 0])) if moments.shape[1] == 2 else np.nan
+
+
+def fields(state: State) -> Any:
+    """rho and the order parameters in the order of the particles, (n, 1 + particles)."""
+    return state.u[:, [0, *(1 + state.slot_of)]]
 
 
 def median(measure: Callable[[], float], runs: int) -> float:
@@ -85,8 +98,9 @@ def bench_two_discs() -> None:
 
         def measure(case: Case = case) -> float:
             nonlocal evaluations
-            seconds, evaluations = time_loop(case)
-            return seconds
+            loop = Loop(case)
+            evaluations = loop.evaluations
+            return loop.seconds
 
         seconds = median(measure, 3)
         reference = reference or seconds

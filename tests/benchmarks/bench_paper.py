@@ -16,40 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import Silent, two_discs
+from bench import Loop, two_discs
 
 from frit.solver.case import Case, load_case, parse_case
-from frit.solver.neck import Neck
-from frit.solver.partition import Ranks
-from frit.solver.prepare import build_mesh, make_integrator, prepare
-from frit.solver.run import run
-from frit.solver.state import State
 
 PAPER = Path(__file__).parents[2] / "sweeps" / "paper"
 OFF = {"enabled": False, "few_order_parameters": False}
 ADAPTIVE = {"end": 10.0, "integrator": "adaptive"}
 NECK = 17.33  # nm at t = 10, converged differences
-
-
-class Loop:
-    """A case run in this process on one core: seconds of the time loop, and what came out."""
-
-    def __init__(self, case: Case) -> None:
-        mesh = build_mesh(case, Ranks())
-        scheme, self.state = prepare(case, mesh, Ranks())
-        began = time.process_time()
-        run(scheme, self.state, make_integrator(case, mesh), Silent())
-        self.seconds = time.process_time() - began
-        self.evaluations = self.state.evaluations
-        self.live = scheme.active.live.size / scheme.d.weights.size
-        self.neck = Neck(case, mesh).measure(fields(self.state)) if len(self.state.slot_of) == 2 else np.nan
-        moments = scheme.d.first_moment.T @ fields(self.state)[:, 1:] / (scheme.d.mass @ fields(self.state)[:, 1:])
-        self.distance = float(np.linalg.norm(moments[:, 1] - moments[:, 0])) if moments.shape[1] == 2 else np.nan
-
-
-def fields(state: State) -> Any:
-    """rho and the order parameters in the order of the particles, (n, 1 + particles)."""
-    return state.u[:, [0, *(1 + state.slot_of)]]
 
 
 class Command:

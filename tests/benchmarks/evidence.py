@@ -13,8 +13,8 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from bench import two_discs
-from bench_paper import NECK, Loop
+from bench import Loop, two_discs
+from bench_paper import NECK
 
 from frit.solver.case import Case, parse_case
 from frit.solver.integrators import paper_step
@@ -22,6 +22,7 @@ from frit.solver.run import RunError
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
 
 HERE = Path(__file__).parent
 
@@ -42,10 +43,19 @@ def errors(loop: Loop, exact: Loop) -> tuple[float, float]:
     return abs(loop.neck / exact.neck - 1.0), abs(loop.distance / exact.distance - 1.0)
 
 
+def finish(axes: Axes, x: str, y: str, name: str) -> None:
+    """Label the axes and write the picture beside this file."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(which="both", alpha=0.3)
+    axes.legend()
+    plt.savefig(HERE / name, dpi=110)
+
+
 def precision() -> None:
     """Both integrators against `rk2` at a fiftieth of its stable step."""
     exact = Loop(pair(integrator="rk2", step=2e-5))
-    figure, axes = plt.subplots(figsize=(6.0, 4.2), layout="constrained")
+    _, axes = plt.subplots(figsize=(6.0, 4.2), layout="constrained")
     for name, key, values in (
         ("rk2", "step", (1e-3, 5e-4, 2e-4, 1e-4)),
         ("adaptive", "tolerance", (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5)),
@@ -58,17 +68,13 @@ def precision() -> None:
         for column, label, style in ((0, "neck", "-o"), (1, "distance", "--s")):
             colour = "tab:blue" if name == "adaptive" else "tab:red"
             axes.loglog(counts, found[:, column], style, color=colour, label=f"{name}, {label}")
-    axes.set_xlabel("evaluations of the rates to t = 1")
-    axes.set_ylabel("relative error at t = 1")
     axes.set_title("A pair of discs of radius 10 nm with rigid motion")
-    axes.grid(which="both", alpha=0.3)
-    axes.legend()
-    figure.savefig(HERE / "precision.png", dpi=110)
+    finish(axes, "evaluations of the rates to t = 1", "relative error at t = 1", "precision.png")
 
 
 def resolution() -> None:
     """Neck error at t = 10 against seconds, each curve one gamma over the spacings."""
-    figure, axes = plt.subplots(figsize=(6.0, 4.2), layout="constrained")
+    _, axes = plt.subplots(figsize=(6.0, 4.2), layout="constrained")
     kinds: list[tuple[str, dict[str, Any]]] = [
         *((f"gamma {gamma}", {"gamma": gamma}) for gamma in (0.8, 1.2, 1.8, 2.5, 4.0)),
         ("linear", {"kind": "linear"}),
@@ -93,12 +99,8 @@ def resolution() -> None:
             )
         axes.loglog(seconds, error, "-o", label=name)
     axes.axhline(0.01, color="grey", linewidth=0.8)
-    axes.set_xlabel("seconds of one core to t = 10")
-    axes.set_ylabel("relative error of the neck at t = 10")
     axes.set_title("Two discs of radius 20 nm, spacing 2, 1.4, 1, 0.7 nm")
-    axes.grid(which="both", alpha=0.3)
-    axes.legend()
-    figure.savefig(HERE / "resolution.png", dpi=110)
+    finish(axes, "seconds of one core to t = 10", "relative error of the neck at t = 10", "resolution.png")
 
 
 FIGURES: dict[str, Callable[[], None]] = {"precision": precision, "resolution": resolution}

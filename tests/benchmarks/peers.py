@@ -113,25 +113,13 @@ def differences() -> Result:
 
 def frit() -> Result:
     """Lattice of spacing 1, the default integrator at its default tolerance."""
-    from bench import Silent, two_discs
+    from bench import Loop, two_discs
 
-    from frit.solver.neck import Neck
-    from frit.solver.partition import Ranks
-    from frit.solver.prepare import build_mesh, make_integrator, prepare
-    from frit.solver.run import run
-
-    case = two_discs(time={"end": END})
-    mesh = build_mesh(case, Ranks())
-    for warm in (True, False):
-        start = time.process_time()
-        scheme, state = prepare(two_discs(time={"end": 0.01}) if warm else case, mesh, Ranks())
-        began = time.process_time()
-        run(scheme, state, make_integrator(scheme.d.case, mesh), Silent())
-        if warm:
-            compiling = time.process_time() - start
-    working = time.process_time() - began
-    fields = state.u[:, [0, *(1 + state.slot_of)]]
-    return Result(compiling, working, Neck(case, mesh).measure(fields), f"adaptive, {state.evaluations} evaluations")
+    start = time.process_time()
+    Loop(two_discs(time={"end": 0.01}))
+    compiled = time.process_time()
+    loop = Loop(two_discs(time={"end": END}))
+    return Result(compiled - start, loop.seconds, loop.neck, f"adaptive, {loop.evaluations} evaluations")
 
 
 # --- py-pde

@@ -103,7 +103,8 @@ def execute(
     if placed is None:
         return "interrupted", "while the particles were packed: nothing to resume, run it again"
     case, packing = placed
-    mesh, identity = build_mesh(case, ranks), asked.identity()
+    rows = fresh or ranks.from_root(checkpoint.by_rows(directory) if ranks.root else None)
+    mesh, identity = build_mesh(case, ranks, rows), asked.identity()
     kept = None if fresh else ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
     scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
     if kept:

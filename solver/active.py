@@ -12,6 +12,7 @@ import numpy as np
 
 from . import kernels, slots
 from .arrays import Flags, Floats, Integers, Numbers
+from .blocks import LiveBlocks, live_blocks
 from .discretisation import WORTH, Discretisation
 from .rigid import rotations
 from .simd import LANES
@@ -26,9 +27,11 @@ SLOT_EPS = 0.3  # eps_eta: unit in which an order parameter's growth is measured
 class Active:
     """The live points and their surroundings at one moment; arrays over this rank's points and nodes."""
 
-    live: Integers  # (L,) numbers of the live points
-    owner: Numbers  # (L, slots) particle of each slot at the live points, -1: none
-    mask: Floats  # (L, F) 1 for rho and the slots that exist at the live points, else 0
+    live: Integers  # numbers of the live points
+    blocks: LiveBlocks  # those of them that are in blocks
+    loose: Integers  # (L,) numbers of those that are not
+    owner: Numbers  # (L, slots) particle of each slot at the loose points, -1: none
+    mask: Floats  # (L, F) 1 for rho and the slots that exist at the loose points, else 0
     present: Flags  # (L, F / LANES) packs of columns that hold anything
     several: Flags  # (L,) points that see more than one particle
     nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
@@ -64,9 +67,10 @@ def activate(d: Discretisation, state: State) -> Active:
     _spread(d, low, high)
     kernels.switch_on(flags, low < high, table.offsets, table.nodes)
     live = np.flatnonzero(flags)
-    mask = np.zeros((live.size, state.u.shape[1]))
+    loose = d.blocks.loose[flags[d.blocks.loose] != 0]
+    mask = np.zeros((loose.size, state.u.shape[1]))
     mask[:, 0] = 1.0
-    mask[:, 1 : 1 + owner.shape[1]] = owner[live] >= 0
+    mask[:, 1 : 1 + owner.shape[1]] = owner[loose] >= 0
     moving, resting = _touched(d, flags != 0), _touched(d, flags == 0)
     edge_nodes = np.flatnonzero(moving & resting & (high >= 0))
     potential, drift = _still_shares(d, state, flags, owner, edge_nodes, high)
@@ -77,9 +81,11 @@ def activate(d: Discretisation, state: State) -> Active:
     kernels.watch_nodes(watch, flags, owner, state.owner, table.offsets, table.nodes, table.rows, table.table)
     return Active(
         live=live,
-        owner=owner[live],
+        blocks=live_blocks(d.blocks, flags, owner, d.weights),
+        loose=loose,
+        owner=owner[loose],
         mask=mask,
-        present=(mask != 0.0).reshape(live.size, -1, LANES).any(axis=2),
+        present=(mask != 0.0).reshape(loose.size, mask.shape[1] // LANES, LANES).any(axis=2),
         several=mask.sum(axis=1) > 2.0,
         nodes=np.flatnonzero(moving),
         owned=d.share.owned[moving[d.share.owned]],

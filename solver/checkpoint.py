@@ -17,8 +17,8 @@ from .scheme import Scheme
 from .state import State
 
 NAME = "checkpoint.h5"
-FORMAT = 2
-READABLE = (1, 2)  # 1 lacks the rigid motion
+FORMAT = 3
+READABLE = (1, 2, 3)  # 1 lacks the rigid motion; in 1 and 2 the nodes of a lattice follow the space-filling curve
 
 
 class CheckpointError(RuntimeError):
@@ -85,6 +85,15 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
     state = State(*counts, values["u"], values["owner"], values["slot_of"])
     reference = State(*counts, values["reference"], values["owner"], values["slot_of"])
     return Checkpoint(state, reference, notes["memory"], values.get("motion"), notes["wall_time"])
+
+
+def by_rows(directory: Path) -> bool:
+    """Whether the checkpoint numbers the nodes of a lattice by rows; True where `read` will find out what is wrong."""
+    try:
+        with h5py.File(directory / NAME) as file:
+            return int(file.attrs["format"]) >= 3
+    except (OSError, KeyError):
+        return True
 
 
 def mesh_hash(mesh: Mesh) -> str:

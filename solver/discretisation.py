@@ -6,6 +6,7 @@ import numpy as np
 
 from . import kernels
 from .arrays import Floats, Numbers
+from .blocks import Blocks, find_blocks
 from .case import Case
 from .energy import Coefficients
 from .geometry import Mesh
@@ -25,6 +26,7 @@ class Discretisation:
     case: Case
     share: Share
     shape: ShapeTable
+    blocks: Blocks
     positions: Floats  # (n, dim) of this rank's nodes, nm
     x: Floats  # (p, dim)
     weights: Floats  # (p,) nm^dim
@@ -78,7 +80,7 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
     return Discretisation(
-        case, share, table, mesh.nodes[nodes], x, weights, mass, first_moment,
+        case, share, table, find_blocks(table, x), mesh.nodes[nodes], x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
 

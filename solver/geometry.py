@@ -1,4 +1,4 @@
-"""Meshes: nodes, simplex cells and one material point per cell, numbered along a space-filling curve.
+"""Meshes: nodes, simplex cells and one material point per cell, numbered so that neighbours lie near in memory.
 
 The points integrate (Huang et al. 2023, equations 17-29): x_p is the barycentre of cell p, w_p its volume.
 Lattices, gmsh and mesh files all end in `_build`, so every mesh has passed the same checks.
@@ -47,27 +47,28 @@ class Mesh:
     spacing: Floats  # (p,) local nodal spacing h
 
 
-def make_mesh(nodes: "Nodes", size: Sequence[float]) -> Mesh:
-    """The mesh that the case asks for, in the box [0, size]."""
+def make_mesh(nodes: "Nodes", size: Sequence[float], rows: bool = True) -> Mesh:
+    """The mesh that the case asks for, in the box [0, size]; rows: how to number the nodes of a lattice."""
     if nodes.source == "file" and nodes.path is not None:
         return file_mesh(nodes.path, size)
     if nodes.source != "file" and nodes.spacing is not None:
-        return (lattice if nodes.source == "lattice" else gmsh_mesh)(size, nodes.spacing)
+        return lattice(size, nodes.spacing, rows) if nodes.source == "lattice" else gmsh_mesh(size, nodes.spacing)
     raise MeshError(f"nodes: source {nodes.source}, spacing {nodes.spacing}, path {nodes.path}: one missing")
 
 
-def lattice(size: Sequence[float], spacing: float) -> Mesh:
+def lattice(size: Sequence[float], spacing: float, rows: bool = True) -> Mesh:
     """Equilateral triangular (2-D) or body-centred cubic (3-D) nodes, nearest neighbours at `spacing`.
 
     Each axis is stretched by at most half a cell so that the lattice fills the box. The walls are flat: they
-    halve the triangles or tetrahedra that they cut.
+    halve the triangles or tetrahedra that they cut. Nodes are numbered along x, then y, then z: `blocks` lives on
+    that. rows False: along the space-filling curve, as frit did before (checkpoints of that time need it).
     """
     box = _checked_box(size, spacing)
     pitch = (spacing, spacing * math.sqrt(3) / 2) if len(box) == 2 else (2 * spacing / math.sqrt(3),) * 3
     counts = [max(1, round(length / step)) for length, step in zip(box, pitch, strict=True)]
     if 2 * math.prod(n + 2 for n in counts) > np.iinfo(np.int32).max:
         raise MeshError(f"spacing {spacing} in a box of {box}: too many nodes for 32-bit node numbers")
-    return _build(*(_triangular if len(box) == 2 else _body_centred)(box, counts), spacing)
+    return _build(*(_triangular if len(box) == 2 else _body_centred)(box, counts), spacing, rows)
 
 
 def _checked_box(size: Sequence[float], spacing: float) -> tuple[float, ...]:
@@ -212,8 +213,11 @@ def _refuse_outside(path: str | Path, nodes: Floats, used: Integers, box: Floats
         raise MeshError(f"{path}: not planar: z from {x[:, dim].min()} to {x[:, dim].max()} in a 2-D domain")
 
 
-def _build(nodes: Floats, cells: Numbers, spacing: float | None) -> Mesh:
-    """Check, orient (in place) and order; spacing None: measure it. Errors number them as given."""
+def _build(nodes: Floats, cells: Numbers, spacing: float | None, rows: bool = False) -> Mesh:
+    """Check, orient (in place) and order, nodes by rows or curve; spacing None: measure it.
+
+    Errors number nodes and cells as given.
+    """
     used = np.zeros(len(nodes), dtype=np.bool_)
     for column in cells.T:
         used[column] = True
@@ -225,7 +229,7 @@ def _build(nodes: Floats, cells: Numbers, spacing: float | None) -> Mesh:
     flip = np.flatnonzero(volumes < 0)
     cells[flip, -2], cells[flip, -1] = cells[flip, -1], cells[flip, -2]
 
-    numbers = numbers[_along_curve(nodes[numbers], lower, extent)]
+    numbers = numbers[np.lexsort(nodes[numbers].T) if rows else _along_curve(nodes[numbers], lower, extent)]
     order = _along_curve(points, lower, extent)
     rank = np.empty(len(nodes), dtype=np.int32)
     rank[numbers] = np.arange(len(numbers), dtype=np.int32)

@@ -3,17 +3,17 @@
 Layout. `u` (n, F) holds a node's fields side by side: column 0 is rho, column 1 + s is slot s of eta, F is a multiple
 of LANES. Point p sees nodes[offsets[p] + i] for i < offsets[p + 1] - offsets[p], with the shape functions
 table[:, rows[p] + i] = (N, dN/dx, dN/dy[, dN/dz]); on a lattice most points share one row of the table. Rows start at
-multiples of LANES and are filled up with zeros. `live` lists the points that are integrated, l counts along it, and
-owner[l, s] is the particle that slot s means at that point, or -1: such a slot does not exist there, mask[l] is 0 in
-its column, and present[l, b] tells whether pack b of columns holds anything at all.
-Point fields are kept in `point` (L (1 + dim), F): row l (1 + dim) holds the values at live point l, the next dim rows
-their derivatives.
+multiples of LANES and are filled up with zeros. `loose` lists the live points that are in no block (those are for
+`block_kernels`), l counts along it, and owner[l, s] is the particle that slot s means at that point, or -1: such a slot
+does not exist there, mask[l] is 0 in its column, and present[l, b] tells whether pack b of columns holds anything at
+all. Point fields are kept in `point` (L (1 + dim), F): row l (1 + dim) holds the values at point loose[l], the next dim
+rows their derivatives.
 """
 
 import numpy as np
 
 from .arrays import Bytes, Flags, Floats, Integers, Numbers
-from .energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
+from .energy import Coefficients, Field, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
 from .simd import LANES, first, load, positive, splat, store, total, with_first
 
@@ -112,18 +112,18 @@ def gradient(
 @jit
 def potential(
     W: Floats, touching: Integers, point: Floats, D: Floats, squares: Floats, u: Floats,
-    live: Integers, mask: Floats, present: Flags, several: Flags, weights: Floats,
+    loose: Integers, mask: Floats, present: Flags, several: Flags, weights: Floats,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients,
 ) -> int:
-    """First half of an evaluation: fields at the live points, D, and their shares of W; how many points touch.
+    """First half of an evaluation: fields at the loose live points, D, their shares of W; how many points touch.
 
-    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching (L,) from its start with the l of the
-    points where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2.
+    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching from its start with the l of the points
+    where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2.
     """
     width = table.shape[0]
     touches = 0
-    for l in range(live.size):
-        p = live[l]
+    for l in range(loose.size):
+        p = loose[l]
         row = l * width
         begin = offsets[p]
         count = offsets[p + 1] - begin
@@ -164,19 +164,21 @@ def potential(
 
 
 @jit
-def touching_share(point: Floats, row: int, i: int, j: int, w: float, dim: int, c: float) -> float:
-    """The share of a point's cell in which eta_a eta_b > c; a, b in columns i, j.
+def touching_share(contacts: Floats, r: int, w: float, dim: int, c: float) -> float:
+    """The share of a point's cell in which eta_a eta_b > c, for row r of the contacts.
 
     The cell counts as a ball of its volume w, and the product as linear in it: with d the distance of the level c from
     the point in radii, 1/2 + d (3 - d^2) / 4 of the ball are above it. As an interface sweeps over the points the
     contact force then follows it without jumps; as the cells shrink, it becomes the bracket of (6).
     """
-    product = point[row, i] * point[row, j]
+    a = 1 + dim
+    b = 2 + 2 * dim
+    product = contacts[r, a] * contacts[r, b]
     if abs(product - c) >= 0.5 * c:  # no cell counts as larger than that
         return 1.0 if product > c else 0.0
     square = 0.0
     for k in range(1, 1 + dim):
-        slope = point[row, i] * point[row + k, j] + point[row, j] * point[row + k, i]
+        slope = contacts[r, a] * contacts[r, b + k] + contacts[r, b] * contacts[r, a + k]
         square += slope * slope
     radius = np.sqrt(w / np.pi) if dim == 2 else np.cbrt(0.75 * w / np.pi)
     reach = min(radius * np.sqrt(square), 0.5 * c)
@@ -187,114 +189,136 @@ def touching_share(point: Floats, row: int, i: int, j: int, w: float, dim: int, 
 
 
 @jit
+def meet(
+    contacts: Floats, between: Numbers, where: Integers, share: Floats, count: int,
+    touching: Integers, point: Floats, loose: Integers, owner: Numbers, weights: Floats, dim: int, c: float,
+) -> int:
+    """The pairs of particles that touch at the loose points; how many pairs there are now, `count` of them before.
+
+    Pair r at point where[r]: between[r] = (a, b), a < b; share[r] = w_p times `touching_share`; contacts[r] = rho,
+    grad rho, eta_a, grad eta_a, eta_b, grad eta_b. Pairs beyond the length of the arrays are counted only. Expects the
+    fields that `potential` left in `point`.
+    """
+    for l in touching:
+        if l < 0:  # in a block
+            continue
+        row = l * (1 + dim)
+        for s in range(owner.shape[1]):
+            if owner[l, s] < 0 or point[row, 1 + s] <= 0.0:
+                continue
+            for t in range(s + 1, owner.shape[1]):
+                if owner[l, t] < 0 or point[row, 1 + t] <= 0.0:
+                    continue
+                r = min(count, share.size - 1)
+                first_column, second_column = (1 + s, 1 + t) if owner[l, s] < owner[l, t] else (1 + t, 1 + s)
+                between[r, 0] = owner[l, first_column - 1]
+                between[r, 1] = owner[l, second_column - 1]
+                where[r] = loose[l]
+                for k in range(1 + dim):
+                    contacts[r, k] = point[row + k, 0]
+                    contacts[r, 1 + dim + k] = point[row + k, first_column]
+                    contacts[r, 2 + 2 * dim + k] = point[row + k, second_column]
+                share[r] = weights[where[r]] * touching_share(contacts, r, weights[where[r]], dim, c)
+                count += share[r] > 0.0
+    return count
+
+
+@jit
 def contact_forces(
-    force: Floats, touching: Integers, point: Floats, live: Integers, owner: Numbers,
-    weights: Floats, x: Floats, m: Coefficients,
+    force: Floats, count: int, contacts: Floats, between: Numbers, where: Integers, share: Floats, x: Floats,
+    m: Coefficients,
 ) -> None:
-    """Add b_a w_p and (x_p cross b_a) w_p of every touching pair to the particles' forces and torques   (25)-(27)
+    """Add b_a w_p and (x_p cross b_a) w_p of every pair that `meet` found to the forces and torques   (25)-(27)
 
     b_a = k sum_{b != a} (rho - rho_0) [eta_a eta_b > c] (grad eta_a - grad eta_b), the bracket as `touching_share`.
     force (particles, dim + rotations); x is measured from the origin that `rigid.velocities` moves to the particle's
-    centre. Expects the fields that `potential` left in `point`.
+    centre.
     """
     dim = x.shape[1]
-    slots = owner.shape[1]
     push = np.zeros(6)
-    for l in touching:
-        p = live[l]
-        row = l * (1 + dim)
-        for s in range(slots):
-            a = owner[l, s]
-            if a < 0 or point[row, 1 + s] <= 0.0:
-                continue
-            for t in range(s + 1, slots):
-                b = owner[l, t]
-                if b < 0 or point[row, 1 + t] <= 0.0:
-                    continue
-                share = touching_share(point, row, 1 + s, 1 + t, weights[p], dim, m.c)
-                if share == 0.0:
-                    continue
-                pull = share * weights[p] * m.k * (point[row, 0] - m.rho_0)
-                for k in range(dim):
-                    push[k] = pull * (point[row + 1 + k, 1 + s] - point[row + 1 + k, 1 + t])
-                turn(push, x[p])
-                for k in range(force.shape[1]):
-                    force[a, k] += push[k]
-                    force[b, k] -= push[k]
+    for r in range(count):
+        pull = share[r] * m.k * (contacts[r, 0] - m.rho_0)
+        for k in range(dim):
+            push[k] = pull * (contacts[r, 2 + dim + k] - contacts[r, 3 + 2 * dim + k])
+        turn(push, x, where[r])
+        for k in range(force.shape[1]):
+            force[between[r, 0], k] += push[k]
+            force[between[r, 1], k] -= push[k]
 
 
 @jit
 def contact_stiffness(
-    stiffness: Floats, keys: Integers, touching: Integers, point: Floats, live: Integers, owner: Numbers,
-    weights: Floats, x: Floats, particles: int, m: Coefficients, huang: bool,
+    stiffness: Floats, keys: Integers, count: int, contacts: Floats, between: Numbers, where: Integers, share: Floats,
+    x: Floats, particles: int, m: Coefficients, huang: bool,
 ) -> None:
-    """How the contact forces answer to rigid motion: stiffness[pair] += w_p k e_p (d_a, d_b) over touching points.
+    """How the contact forces answer to rigid motion: stiffness[pair] += w_p k e_p (d_a, d_b) over the pairs of `meet`.
 
     Moving particle c with (v, omega) changes rho at x by -(v, omega) . d_c, d_c = (grad q, x cross grad q) with
     q = rho eta_c^2 [`wang`: rho eta_c]; the force on a is k (rho - rho_0) e, e = (g, x cross g) with
     g = grad eta_a - grad eta_b.
-    stiffness (pairs, 2, dim + rotations, dim + rotations); keys (pairs,) sorted a particles + b with a < b. Expects the
-    fields that `potential` left in `point`.
+    stiffness (pairs, 2, dim + rotations, dim + rotations); keys (pairs,) sorted a particles + b with a < b.
     """
     dim = x.shape[1]
     size = stiffness.shape[2]
     direction = np.zeros(6)
-    answer = np.zeros((2, 6))
-    for l in touching:
-        row = l * (1 + dim)
-        p = live[l]
-        for s in range(owner.shape[1]):
-            for t in range(owner.shape[1]):
-                a = owner[l, s]
-                b = owner[l, t]
-                if a < 0 or b <= a or point[row, 1 + s] <= 0.0 or point[row, 1 + t] <= 0.0:
-                    continue
-                share = touching_share(point, row, 1 + s, 1 + t, weights[p], dim, m.c)
-                if share == 0.0:
-                    continue
-                for k in range(dim):
-                    direction[k] = point[row + 1 + k, 1 + s] - point[row + 1 + k, 1 + t]
-                    answer[0, k] = carried_slope(point, row, 1 + s, k, huang)
-                    answer[1, k] = carried_slope(point, row, 1 + t, k, huang)
-                turn(direction, x[p])
-                turn(answer[0], x[p])
-                turn(answer[1], x[p])
-                pair = np.searchsorted(keys, a * particles + b)
-                for c in range(2):
-                    for i in range(size):
-                        for j in range(size):
-                            stiffness[pair, c, i, j] += share * weights[p] * m.k * direction[i] * answer[c, j]
+    answer_a = np.zeros(6)
+    answer_b = np.zeros(6)
+    for r in range(count):
+        for k in range(dim):
+            direction[k] = contacts[r, 2 + dim + k] - contacts[r, 3 + 2 * dim + k]
+            answer_a[k] = carried_slope(contacts, r, 1 + dim, k, huang)
+            answer_b[k] = carried_slope(contacts, r, 2 + 2 * dim, k, huang)
+        turn(direction, x, where[r])
+        turn(answer_a, x, where[r])
+        turn(answer_b, x, where[r])
+        pair = np.searchsorted(keys, np.int64(between[r, 0]) * particles + between[r, 1])
+        for i in range(size):
+            scaled = share[r] * m.k * direction[i]
+            for j in range(size):
+                stiffness[pair, 0, i, j] += scaled * answer_a[j]
+                stiffness[pair, 1, i, j] += scaled * answer_b[j]
 
 
 @jit
-def carried_slope(point: Floats, row: int, column: int, k: int, huang: bool) -> float:
-    """Component k of grad(rho eta^2) [`wang`: grad(rho eta)] at a point."""
-    rho = point[row, 0]
-    eta = point[row, column]
+def carried_slope(contacts: Floats, r: int, column: int, k: int, huang: bool) -> float:
+    """Component k of grad(rho eta^2) [`wang`: grad(rho eta)] for the particle whose eta is in that column."""
+    rho = contacts[r, 0]
+    eta = contacts[r, column]
     if huang:
-        return float(eta * eta * point[row + 1 + k, 0] + 2.0 * rho * eta * point[row + 1 + k, column])
-    return float(eta * point[row + 1 + k, 0] + rho * point[row + 1 + k, column])
+        return float(eta * eta * contacts[r, 1 + k] + 2.0 * rho * eta * contacts[r, column + 1 + k])
+    return float(eta * contacts[r, 1 + k] + rho * contacts[r, column + 1 + k])
 
 
 @jit
-def turn(vector: Floats, x: Floats) -> None:
-    """Append x cross v to v: one number in the plane, three in space."""
-    if x.shape[0] == 2:
-        vector[2] = x[0] * vector[1] - x[1] * vector[0]
+def turn(vector: Floats, x: Floats, p: int) -> None:
+    """Append x_p cross v to v: one number in the plane, three in space."""
+    if x.shape[1] == 2:
+        vector[2] = x[p, 0] * vector[1] - x[p, 1] * vector[0]
         return
-    vector[3] = x[1] * vector[2] - x[2] * vector[1]
-    vector[4] = x[2] * vector[0] - x[0] * vector[2]
-    vector[5] = x[0] * vector[1] - x[1] * vector[0]
+    vector[3] = x[p, 1] * vector[2] - x[p, 2] * vector[1]
+    vector[4] = x[p, 2] * vector[0] - x[p, 0] * vector[2]
+    vector[5] = x[p, 0] * vector[1] - x[p, 1] * vector[0]
 
 
 @inlined
-def rigid_velocity(motion: Floats, a: int, x: Floats, k: int, dim: int) -> float:
-    """Component k of V_a(x) = v_a + omega_a cross x; motion[a] = (v_a, omega_a), v_a taken at the origin of x."""
-    if dim == 2:
-        return float(motion[a, 0] - motion[a, 2] * x[1] if k == 0 else motion[a, 1] + motion[a, 2] * x[0])
-    i = (k + 1) % 3
-    j = (k + 2) % 3
-    return float(motion[a, k] + motion[a, 3 + i] * x[j] - motion[a, 3 + j] * x[i])
+def x_velocity(motion: Floats, a: int, y: Field, z: Field) -> Field:
+    """V_x of V_a(r) = v_a + omega_a cross r; motion[a] = (v_a, omega_a), three components each: `rigid.in_space`."""
+    v: Field = motion[a, 0] + motion[a, 4] * z - motion[a, 5] * y
+    return v
+
+
+@inlined
+def y_velocity(motion: Floats, a: int, x: Field, z: Field) -> Field:
+    """V_y, see `x_velocity`."""
+    v: Field = motion[a, 1] + motion[a, 5] * x - motion[a, 3] * z
+    return v
+
+
+@inlined
+def z_velocity(motion: Floats, a: int, x: Field, y: Field) -> Field:
+    """V_z, see `x_velocity`."""
+    v: Field = motion[a, 2] + motion[a, 3] * y - motion[a, 4] * x
+    return v
 
 
 @inlined
@@ -302,18 +326,23 @@ def fill_velocities(velocity: Floats, motion: Floats, owner: Numbers, l: int, x:
     """velocity[k, 1 + s] = component k of V_a(x), a = owner[l, s]; 0 where a slot does not exist."""
     for s in range(owner.shape[1]):
         a = owner[l, s]
-        for k in range(x.shape[0]):
-            velocity[k, 1 + s] = rigid_velocity(motion, a, x, k, x.shape[0]) if a >= 0 else 0.0
+        for k in range(velocity.shape[0]):
+            velocity[k, 1 + s] = 0.0
+        if a >= 0:
+            velocity[0, 1 + s] = x_velocity(motion, a, x[1], x[-1])
+            velocity[1, 1 + s] = y_velocity(motion, a, x[0], x[-1])
+            if x.size == 3:
+                velocity[2, 1 + s] = z_velocity(motion, a, x[0], x[1])
 
 
 @jit
 def divergence(
     rate: Floats, point: Floats, D: Floats, squares: Floats, W: Floats, motion: Floats, velocity: Floats,
-    live: Integers, owner: Numbers, present: Flags, weights: Floats, x: Floats,
+    loose: Integers, owner: Numbers, present: Flags, weights: Floats, x: Floats,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats,
     m: Coefficients, rigid: bool, huang: bool,
 ) -> None:
-    """Second half of an evaluation: the fluxes at the live points, scattered to the nodes   (20), (21)
+    """Second half of an evaluation: the fluxes at the loose live points, scattered to the nodes   (20), (21)
 
     rate (n, F) gets partial sums, before the 1/m_a. The rows of `point` are turned from fields into sources and fluxes:
     rho:   source 0,               flux -D grad W + rho v_adv
@@ -323,8 +352,8 @@ def divergence(
     dim = x.shape[1]
     advection = np.zeros(3)
     slope = np.zeros(3)
-    for l in range(live.size):
-        p = live[l]
+    for l in range(loose.size):
+        p = loose[l]
         row = l * (1 + dim)
         begin = offsets[p]
         count = offsets[p + 1] - begin

@@ -14,10 +14,13 @@ from .scheme import Scheme
 from .state import State, initial_state
 
 
-def build_mesh(case: Case, ranks: Ranks) -> Mesh:
-    """The case's mesh on every rank. A lattice is built by each; a generated or read mesh comes from rank 0."""
+def build_mesh(case: Case, ranks: Ranks, rows: bool = True) -> Mesh:
+    """The case's mesh on every rank. A lattice is built by each; a generated or read mesh comes from rank 0.
+
+    rows: see `geometry.lattice`.
+    """
     if case.nodes.source == "lattice":
-        return make_mesh(case.nodes, case.domain.size)
+        return make_mesh(case.nodes, case.domain.size, rows)
     mesh: Mesh = ranks.from_root(make_mesh(case.nodes, case.domain.size) if ranks.root else None)
     return mesh
 

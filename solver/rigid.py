@@ -52,6 +52,15 @@ def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
     return np.hstack([m.m_t * F / volume - cross(omega, centre), omega])
 
 
+def in_space(motion: Floats) -> Floats:
+    """Rigid motions (particles, dim + rotations) with three components each of v and omega: (particles, 6)."""
+    if motion.shape[1] == 6:
+        return motion
+    whole = np.zeros((len(motion), 6))
+    whole[:, :2], whole[:, 5] = motion[:, :2], motion[:, 2]
+    return whole
+
+
 @dataclass(frozen=True)
 class Relaxation:
     """Contacts that relax no faster than 1 / tau: the map from the free motion V = M Q to the V_tau of

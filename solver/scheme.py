@@ -8,10 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from . import kernels, rigid
+from . import block_kernels, kernels, rigid
 from .active import Active, activate
 from .arrays import Floats
 from .discretisation import Discretisation
+from .simd import LANES
 from .state import State
 
 
@@ -23,6 +24,8 @@ class Scheme:
         self.particles = len(state.slot_of)
         self.relax: Callable[[Floats], Floats] = lambda motion: motion
         self.motion = np.zeros((self.particles, d.dim + rigid.rotations(d.dim)))
+        self.touches = self.meetings = 0
+        self._make_room(64)
         self.activate(state)
 
     def activate(self, state: State) -> None:
@@ -31,24 +34,34 @@ class Scheme:
             self._activate(state)
 
     def _activate(self, state: State) -> None:
-        self.point = np.empty((0, 0))  # free the largest array before the next one is made
+        self.point = self.fields = np.empty((0, 0))  # free the largest arrays before the next ones are made
         self.active: Active = activate(self.d, state)
-        points = self.active.live.size
+        d, a, columns = self.d, self.active, state.u.shape[1]
         self.slot_of, self.node_owner = state.slot_of, state.owner
-        self.W = np.zeros(self.d.nodes)
         self.inverse_mass = np.zeros_like(state.u)  # 1 / m_a; 0 in slots that no particle has at the node
         self.inverse_mass[:, 0] = 1.0
         self.inverse_mass[:, 1 : 1 + state.owner.shape[1]] = state.owner >= 0
-        self.inverse_mass /= self.d.mass[:, None]
-        self.D, self.S2 = np.empty((2, points))
-        self.touching, self.touches = np.empty(points, dtype=np.int64), 0
-        self.point = np.zeros((points * (1 + self.d.dim), state.u.shape[1]))
+        self.inverse_mass /= d.mass[:, None]
+
+        # Nodes: W, and fields and rates by columns for the points in blocks; see `block_kernels`
+        self.u_columns, self.rate_columns = np.zeros((2, columns, d.nodes + LANES))
+        self.W_row = np.zeros((1, d.nodes + LANES))
+        self.W = self.W_row[0, : d.nodes]
+
+        # Points: fields, D and S2, loose and in blocks
+        self.D, self.S2 = np.empty((2, a.loose.size))
+        self.point = np.zeros((a.loose.size * (1 + d.dim), columns))
+        self.D_blocks, self.S2_blocks = np.empty((2, a.blocks.blocks.size, LANES))
+        self.fields = np.zeros((a.blocks.column.size * (1 + d.dim), LANES))
+        self.touching = np.empty(a.live.size, dtype=np.int64)
+        self.work = np.empty((1, d.shape.longest))
+        self.velocity = np.zeros((d.dim, columns))
+
+        # Particles: forces and moments, and what contacts measured next carry on from: a resumed run needs it
         size = self.motion.shape[1]
-        self.sums = np.zeros((self.particles, size + 1 + self.d.dim))
+        self.sums = np.zeros((self.particles, size + 1 + d.dim))
         self.forces, self.moments = self.sums[:, :size], self.sums[:, size:]
-        self.carried = self.motion  # what contacts measured next carry on from: a resumed run needs it
-        self.work = np.empty((1, self.d.shape.longest))
-        self.velocity = np.zeros((self.d.dim, state.u.shape[1]))
+        self.carried = self.motion
 
     def rates(self, u: Floats, rate: Floats, tau: float | None = None) -> None:
         """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective.
@@ -56,7 +69,7 @@ class Scheme:
         tau: measure the contacts' stiffness here, and from now on let them relax no faster than 1 / tau around the
         motion of the evaluation before; see `rigid.Relaxation`.
         """
-        d, a, m, table = self.d, self.active, self.d.coefficients, self.d.shape
+        d, a, m = self.d, self.active, self.d.coefficients
         moving = d.case.model.rigid_motion
         watch = d.share.ranks.watch
         before = watch.enter("gather")
@@ -70,6 +83,7 @@ class Scheme:
         # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
         watch.enter("rigid motion")
         if moving:
+            self._meet()
             forces, moments = self._bodies(u)
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
@@ -81,12 +95,7 @@ class Scheme:
         #   rate rho_a = 1/m_a sum_p w_p [ -D grad N_a . grad W_p + rho_p grad N_a . v_adv ]
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
         watch.enter("scatter")
-        kernels.clear(rate, a.nodes)
-        kernels.divergence(
-            rate, self.point, self.D, self.S2, self.W, self.motion, self.velocity,
-            a.live, a.owner, a.present, d.weights, d.x,
-            table.offsets, table.nodes, table.rows, table.table, self.work, m, moving, d.huang,
-        )
+        self._scatter(rate)
         if moving:
             kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
         d.share.halo.add(rate)
@@ -94,13 +103,13 @@ class Scheme:
         watch.enter(before)
 
     def _stiffness(self) -> Floats:
-        """How the contact forces answer to rigid motion, (pairs, 2, k, k) summed over the ranks, after `_gather`."""
+        """How the contact forces answer to rigid motion, (pairs, 2, k, k) summed over the ranks, after `_meet`."""
         d, a = self.d, self.active
         size = self.motion.shape[1]
         stiffness = np.zeros((len(a.pairs), 2, size, size))
         keys = a.pairs[:, 0] * self.particles + a.pairs[:, 1]
         kernels.contact_stiffness(
-            stiffness, keys, self.touching[: self.touches], self.point, a.live, a.owner, d.weights, d.x,
+            stiffness, keys, self.meetings, self.contacts, self.between, self.where, self.share, d.x,
             self.particles, d.coefficients, d.huang,
         )
         return d.share.ranks.sum(stiffness)
@@ -109,17 +118,63 @@ class Scheme:
         """Fields and D of this rank's points, and its part of W, in the work arrays."""
         d, a, table = self.d, self.active, self.d.shape
         kernels.start(self.W, a.potential, a.nodes)
-        self.touches = kernels.potential(
-            self.W, self.touching, self.point, self.D, self.S2, u, a.live, a.mask, a.present, a.several,
+        touches = kernels.potential(
+            self.W, self.touching, self.point, self.D, self.S2, u, a.loose, a.mask, a.present, a.several,
             d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
         )
+        block_kernels.to_columns(self.u_columns, u, a.nodes)
+        self.touches = block_kernels.potential(
+            self.W_row, self.touching, touches, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
+            a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.mask, a.blocks.partial,
+            d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table, d.coefficients,
+        )
+
+    def _scatter(self, rate: Floats) -> None:
+        """Sources and fluxes of this rank's points, summed into rate, after `_gather` and once the motion is known."""
+        d, a, table = self.d, self.active, self.d.shape
+        moving, motion = d.case.model.rigid_motion, rigid.in_space(self.motion)
+        self.rate_columns[:] = 0.0
+        block_kernels.divergence(
+            self.rate_columns, self.fields, self.D_blocks, self.S2_blocks, self.W_row, motion,
+            a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.particle, a.blocks.owner,
+            d.blocks.x, d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table,
+            d.coefficients, moving, d.huang,
+        )
+        block_kernels.from_columns(rate, self.rate_columns, a.nodes)
+        kernels.divergence(
+            rate, self.point, self.D, self.S2, self.W, motion, self.velocity,
+            a.loose, a.owner, a.present, d.weights, d.x,
+            table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang,
+        )
+
+    def _meet(self) -> None:
+        """The pairs of particles that touch at this rank's points, after `_gather`; room for more is made if needed."""
+        d, a, c = self.d, self.active, self.d.coefficients.c
+        touching = self.touching[: self.touches]
+        while True:
+            found = self.contacts, self.between, self.where, self.share
+            count = kernels.meet(*found, 0, touching, self.point, a.loose, a.owner, d.weights, d.dim, c)
+            self.meetings = block_kernels.meet(
+                *found, count, touching, self.fields, a.blocks.blocks, a.blocks.first, a.blocks.owner,
+                d.blocks.points, d.weights, d.dim, c,
+            )
+            if self.meetings < len(self.share):
+                return
+            self._make_room(2 * self.meetings)
+
+    def _make_room(self, pairs: int) -> None:
+        """For that many pairs that touch at a point."""
+        self.contacts = np.empty((pairs, 3 * (1 + self.d.dim)))
+        self.between = np.empty((pairs, 2), dtype=np.int32)
+        self.where = np.empty(pairs, dtype=np.int64)
+        self.share = np.empty(pairs)
 
     def _bodies(self, u: Floats) -> tuple[Floats, Floats]:
-        """Contact forces and moments of all particles, summed over the ranks, after `_gather`."""
+        """Contact forces and moments of all particles, summed over the ranks, after `_meet`."""
         d, a = self.d, self.active
         self.sums[:] = 0.0
         kernels.contact_forces(
-            self.forces, self.touching[: self.touches], self.point, a.live, a.owner, d.weights, d.x, d.coefficients
+            self.forces, self.meetings, self.contacts, self.between, self.where, self.share, d.x, d.coefficients
         )
         self.moments += a.moments
         kernels.add_moments(self.moments, u, a.owned, self.node_owner, d.mass, d.first_moment)

@@ -169,13 +169,15 @@ def arrange(
 ) -> None:
     """Order each point's neighbours by their displacement in units of h, and give equal patterns equal keys.
 
-    Displacements count as equal within 2^-30 h. Both order and key come from a hash: only equality matters.
+    Displacements count as equal within 2^-30 h. The order is that of x: nodes of one row, to which `block_kernels` adds
+    overlapping packs, then come far apart. Beyond that, order and key come from a hash: only equality matters.
     """
     dim = points.shape[1]
     most = 0
     for p in range(keys.size):
         most = max(most, offsets[p + 1] - offsets[p])
     code = np.empty(most, dtype=np.uint64)
+    along = np.empty(most, dtype=np.uint64)
     sorted_near = np.empty(most, dtype=near.dtype)
     for p in range(keys.size):
         first = offsets[p]
@@ -185,8 +187,11 @@ def arrange(
             for k in range(dim):
                 units = np.rint((nodes[near[first + i], k] - points[p, k]) / spacing[p] * 2.0**30)
                 h = mix(h, np.uint64(np.int64(units)))
+                if k == 0:
+                    along[i] = np.uint64(np.int64(units) + 2**39) << np.uint64(24)
             code[i] = h
-        order = np.argsort(code[:count])
+            along[i] |= h >> np.uint64(40)
+        order = np.argsort(along[:count])
         key = mix(np.uint64(count), np.uint64(np.int64(np.rint(spacing[p] * 2.0**30))))
         for i in range(count):
             key = mix(key, code[order[i]])

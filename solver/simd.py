@@ -9,7 +9,7 @@ and with floats, so that a formula written for a float also serves a pack, and `
 
 import operator
 from collections.abc import Callable
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, TypeVar, cast
 
 from llvmlite import ir
 from numba import types
@@ -134,13 +134,13 @@ def _total(typing: Any, value: Any) -> Any:
 
 @intrinsic
 def _positive(typing: Any, value: Any) -> Any:
-    """positive(pack): max(x, 0) in every lane."""
+    """positive(x): max(x, 0) of a float, or in every lane of a pack."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        zero = ir.Constant(VECTOR, [0.0] * LANES)
+        zero = ir.Constant(VECTOR, [0.0] * LANES) if isinstance(value, PackType) else ir.Constant(DOUBLE, 0.0)
         return builder.select(builder.fcmp_ordered(">", arguments[0], zero), arguments[0], zero)
 
-    return pack(pack), generate
+    return value(value), generate
 
 
 class Pack(Protocol):
@@ -161,7 +161,8 @@ splat = cast(Callable[[float], Pack], _splat)
 first = cast(Callable[[Pack], float], _first)
 with_first = cast(Callable[[Pack, float], Pack], _with_first)
 total = cast(Callable[[Pack], float], _total)
-positive = cast(Callable[[Pack], Pack], _positive)
+Scalar = TypeVar("Scalar", float, Pack)
+positive = cast(Callable[[Scalar], Scalar], _positive)
 
 
 def _lanewise(instruction: str) -> Any:

@@ -173,10 +173,20 @@ def morton(x: list[float], bits: int) -> int:
 
 @pytest.mark.parametrize(("dim", "bits"), [(2, 31), (3, 21)])
 def test_nodes_and_points_follow_mortons_curve(dim: int, bits: int) -> None:
-    mesh = lattice((1.0,) * dim, 0.13)
+    mesh = lattice((1.0,) * dim, 0.13, rows=False)
     for x in (mesh.nodes, mesh.points):
         codes = [morton(row, bits) for row in x.tolist()]
         assert codes == sorted(codes)
+
+
+@pytest.mark.parametrize("size", [(7.0, 5.0), (7.0, 5.0, 4.0)])
+def test_the_nodes_of_a_lattice_are_numbered_by_rows_along_x(size: tuple[float, ...]) -> None:
+    """The same mesh as along the curve: only the numbers of the nodes differ."""
+    mesh, curve = lattice(size, 0.7), lattice(size, 0.7, rows=False)
+    backwards = [tuple(reversed(x)) for x in mesh.nodes.tolist()]
+    assert backwards == sorted(backwards)
+    np.testing.assert_array_equal(mesh.nodes[mesh.cells], curve.nodes[curve.cells])
+    np.testing.assert_array_equal(mesh.points, curve.points)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +223,7 @@ HALVES = [[0, 1, 2], [0, 2, 3]]
 def test_a_file_gives_back_the_mesh_whatever_its_numbering(
     tmp_path: Path, size: tuple[float, ...], kind: str, suffix: str
 ) -> None:
-    mesh, rng = lattice(size, 1.0), np.random.default_rng(5)
+    mesh, rng = lattice(size, 1.0, rows=False), np.random.default_rng(5)
     # Renumber nodes, shuffle cells, turn half of them inside out, add a node without cell and other cells.
     number = rng.permutation(len(mesh.nodes))
     nodes = np.full((len(number) + 1, len(size)), 77.0)
@@ -356,7 +366,8 @@ def test_make_mesh_calls_the_source_of_the_case(
     spacing, path = (None, "a.msh") if source == "file" else (0.5, None)
     nodes: Any = SimpleNamespace(source=source, spacing=spacing, path=path)
     make_mesh(nodes, (3.0, 2.0))
-    assert called == [("a.msh", (3.0, 2.0)) if source == "file" else ((3.0, 2.0), 0.5)]
+    expected = {"file": ("a.msh", (3.0, 2.0)), "lattice": ((3.0, 2.0), 0.5, True), "gmsh": ((3.0, 2.0), 0.5)}
+    assert called == [expected[source]]
     nothing: Any = SimpleNamespace(source=source, spacing=None, path=None)
     with pytest.raises(MeshError, match=f"source {source}"):
         make_mesh(nothing, (3.0, 2.0))

@@ -53,11 +53,11 @@ class Seen(Requests):
         super().__init__()
         Seen.one = self
 
-def hold(case, ranks):
+def hold(case, ranks, rows):
     Path(sys.argv[sys.argv.index("--out") + 1], f"{ranks.rank}.start").touch()
     while not (Seen.one.checkpoint and Seen.one.end):
         time.sleep(0.005)
-    return build_mesh(case, ranks)
+    return build_mesh(case, ranks, rows)
 
 solver.Requests, solver.build_mesh = Seen, hold
 sys.exit(solver.main())

@@ -1,0 +1,332 @@
+"""The loops over blocks of points: `kernels` for eight points at a time, one lane each.
+
+`columns` (F, n + LANES) holds the fields of the nodes one below the other, so that a field's values at the nodes of a
+block's lanes are one pack: the lanes of entry i see nodes[begin + i] ... nodes[begin + i] + 7. Point fields are kept in
+`fields` (E (1 + dim), LANES): row e (1 + dim) holds the values of entry e of `LiveBlocks`, the next dim rows its
+derivatives. Lanes without a live point have the weight 0: they see some nodes, and add zeros to them.
+"""
+
+import numpy as np
+
+from .arrays import Flags, Floats, Integers, Numbers
+from .energy import Coefficients, df_deta, df_drho, mobility
+from .jit import inlined, jit
+from .kernels import touching_share, x_velocity, y_velocity, z_velocity
+from .simd import LANES, load, positive, splat, store
+
+
+@inlined
+def gather(
+    fields: Floats, row: int, columns: Floats, column: int,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats,
+) -> None:
+    """u_p = sum_a N_a(x_p) u_a and grad u_p = sum_a grad N_a(x_p) u_a for one field of a block   (17)"""
+    dim = table.shape[0] - 1
+    value = splat(0.0)
+    x = splat(0.0)
+    y = splat(0.0)
+    z = splat(0.0)
+    for i in range(count):
+        e = start + i
+        field = load(columns, column, nodes[begin + i])
+        value = value + table[0, e] * field
+        x = x + table[1, e] * field
+        y = y + table[2, e] * field
+        if dim == 3:
+            z = z + table[3, e] * field
+    store(fields, row, 0, value)
+    store(fields, row + 1, 0, x)
+    store(fields, row + 2, 0, y)
+    if dim == 3:
+        store(fields, row + 3, 0, z)
+
+
+@inlined
+def gather_two(
+    fields: Floats, row: int, columns: Floats, column: int, other: int,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats,
+) -> None:
+    """`gather` for two fields, of neighbouring entries: twice as many sums that do not wait for each other."""
+    dim = table.shape[0] - 1
+    value = splat(0.0)
+    x = splat(0.0)
+    y = splat(0.0)
+    z = splat(0.0)
+    other_value = splat(0.0)
+    other_x = splat(0.0)
+    other_y = splat(0.0)
+    other_z = splat(0.0)
+    for i in range(count):
+        e = start + i
+        a = nodes[begin + i]
+        field = load(columns, column, a)
+        second = load(columns, other, a)
+        value = value + table[0, e] * field
+        other_value = other_value + table[0, e] * second
+        x = x + table[1, e] * field
+        other_x = other_x + table[1, e] * second
+        y = y + table[2, e] * field
+        other_y = other_y + table[2, e] * second
+        if dim == 3:
+            z = z + table[3, e] * field
+            other_z = other_z + table[3, e] * second
+    store(fields, row, 0, value)
+    store(fields, row + 1, 0, x)
+    store(fields, row + 2, 0, y)
+    next_row = row + 1 + dim
+    store(fields, next_row, 0, other_value)
+    store(fields, next_row + 1, 0, other_x)
+    store(fields, next_row + 2, 0, other_y)
+    if dim == 3:
+        store(fields, row + 3, 0, z)
+        store(fields, next_row + 3, 0, other_z)
+
+
+@inlined
+def scatter(
+    columns: Floats, column: int, flow: Floats, row: int,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats,
+) -> None:
+    """columns_a += N_a(x_p) s_p + grad N_a(x_p) . j_p for a block's source s and flux j, four rows of `flow`."""
+    dim = table.shape[0] - 1
+    source = load(flow, row, 0)
+    x = load(flow, row + 1, 0)
+    y = load(flow, row + 2, 0)
+    z = load(flow, row + 3, 0)
+    for i in range(count):
+        e = start + i
+        a = nodes[begin + i]
+        new = load(columns, column, a) + table[0, e] * source + table[1, e] * x + table[2, e] * y
+        if dim == 3:
+            new = new + table[3, e] * z
+        store(columns, column, a, new)
+
+
+@inlined
+def scatter_two(
+    columns: Floats, column: int, other: int, flow: Floats,
+    begin: int, count: int, start: int, nodes: Numbers, table: Floats,
+) -> None:
+    """`scatter` for two fields, rows 0 to 3 and 4 to 7 of `flow`."""
+    dim = table.shape[0] - 1
+    source = load(flow, 0, 0)
+    x = load(flow, 1, 0)
+    y = load(flow, 2, 0)
+    z = load(flow, 3, 0)
+    other_source = load(flow, 4, 0)
+    other_x = load(flow, 5, 0)
+    other_y = load(flow, 6, 0)
+    other_z = load(flow, 7, 0)
+    for i in range(count):
+        e = start + i
+        a = nodes[begin + i]
+        new = load(columns, column, a) + table[0, e] * source + table[1, e] * x + table[2, e] * y
+        second = load(columns, other, a) + table[0, e] * other_source + table[1, e] * other_x + table[2, e] * other_y
+        if dim == 3:
+            new = new + table[3, e] * z
+            second = second + table[3, e] * other_z
+        store(columns, column, a, new)
+        store(columns, other, a, second)
+
+
+@jit
+def potential(
+    W: Floats, touching: Integers, touches: int, fields: Floats, D: Floats, squares: Floats, columns: Floats,
+    blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, mask: Floats, partial: Flags,
+    begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats, m: Coefficients,
+) -> int:
+    """First half of an evaluation, as `kernels.potential`: fields, D and S2 of the live blocks, their shares of W.
+
+    W (1, n + LANES); touching gets -1 - (LANES l + j) for lane j of block l; returned: `touches` and those.
+    """
+    width = table.shape[0]
+    overlaps = np.empty((1, LANES))
+    flow = np.empty((4, LANES))
+    for l in range(blocks.size):
+        b = blocks[l]
+        begin = begins[b]
+        count = counts[b]
+        start = starts[b]
+        e = first[l]
+        end = first[l + 1]
+        while e + 1 < end:
+            gather_two(fields, e * width, columns, column[e], column[e + 1], begin, count, start, nodes, table)
+            e += 2
+        if e < end:
+            gather(fields, e * width, columns, column[e], begin, count, start, nodes, table)
+        row = first[l] * width
+        rho = load(fields, row, 0)
+        S1 = splat(0.0)
+        S2 = splat(0.0)
+        S3 = splat(0.0)
+        P2 = splat(0.0)
+        for e in range(first[l] + 1, end):
+            eta = load(fields, e * width, 0)
+            if partial[e]:
+                exists = load(mask, e, 0)
+                eta = exists * eta
+                store(fields, e * width, 0, eta)
+                for k in range(1, width):
+                    store(fields, e * width + k, 0, exists * load(fields, e * width + k, 0))
+            inside = positive(eta)
+            S1 = S1 + inside
+            P2 = P2 + inside * inside
+            S2 = S2 + eta * eta
+            S3 = S3 + eta * eta * eta
+        overlap = S1 * S1 - P2
+        store(D, l, 0, mobility(rho, overlap, m))
+        store(squares, l, 0, S2)
+        w = load(live_weights, l, 0)
+        store(flow, 0, 0, w * df_drho(rho, S2, S3, m))
+        for k in range(1, width):
+            store(flow, k, 0, (w * m.kappa_rho) * load(fields, row + k, 0))
+        scatter(W, 0, flow, 0, begin, count, start, nodes, table)
+        if end - first[l] > 2:
+            store(overlaps, 0, 0, overlap)
+            for j in range(LANES):
+                if overlaps[0, j] > m.c and live_weights[l, j] > 0.0:
+                    touching[touches] = -1 - (LANES * l + j)
+                    touches += 1
+    return touches
+
+
+@jit
+def meet(
+    contacts: Floats, between: Numbers, where: Integers, share: Floats, count: int,
+    touching: Integers, fields: Floats, blocks: Integers, first: Integers, owner: Numbers,
+    points: Numbers, weights: Floats, dim: int, c: float,
+) -> int:
+    """`kernels.meet` for the points in blocks."""
+    width = 1 + dim
+    for code in touching:
+        if code >= 0:  # a loose point
+            continue
+        l = (-1 - code) // LANES
+        j = (-1 - code) % LANES
+        for e in range(first[l] + 1, first[l + 1]):
+            if owner[e, j] < 0 or fields[e * width, j] <= 0.0:
+                continue
+            for g in range(e + 1, first[l + 1]):
+                if owner[g, j] < 0 or fields[g * width, j] <= 0.0:
+                    continue
+                r = min(count, share.size - 1)
+                a, b = (e, g) if owner[e, j] < owner[g, j] else (g, e)
+                between[r, 0] = owner[a, j]
+                between[r, 1] = owner[b, j]
+                where[r] = points[blocks[l], j]
+                for k in range(width):
+                    contacts[r, k] = fields[first[l] * width + k, j]
+                    contacts[r, width + k] = fields[a * width + k, j]
+                    contacts[r, 2 * width + k] = fields[b * width + k, j]
+                share[r] = weights[where[r]] * touching_share(contacts, r, weights[where[r]], dim, c)
+                count += share[r] > 0.0
+    return count
+
+
+@jit
+def fill_velocities(velocity: Floats, motion: Floats, owner: Numbers, e: int, x: Floats, row: int) -> None:
+    """velocity[k, j] = component k of V_a(x) in lane j, a = owner[e, j]; 0 where there is none."""
+    for j in range(LANES):
+        a = owner[e, j]
+        for k in range(3):
+            velocity[k, j] = 0.0
+        if a >= 0:
+            velocity[0, j] = x_velocity(motion, a, x[row + 1, j], x[row + 2, j])
+            velocity[1, j] = y_velocity(motion, a, x[row, j], x[row + 2, j])
+            velocity[2, j] = z_velocity(motion, a, x[row, j], x[row + 1, j])
+
+
+@jit
+def divergence(
+    rate: Floats, fields: Floats, D: Floats, squares: Floats, W: Floats, motion: Floats,
+    blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, particle: Numbers, owner: Numbers,
+    x: Floats, begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats,
+    m: Coefficients, rigid: bool, huang: bool,
+) -> None:
+    """Second half of an evaluation, as `kernels.divergence`: fluxes of the live blocks, scattered to rate (F, n + 8).
+
+    """
+    width = table.shape[0]
+    dim = width - 1
+    slope = np.empty((width, LANES))
+    work = np.empty((3, LANES))
+    flow = np.empty((8, LANES))
+    for l in range(blocks.size):
+        b = blocks[l]
+        begin = begins[b]
+        count = counts[b]
+        start = starts[b]
+        row = first[l] * width
+        w = load(live_weights, l, 0)
+        rho = load(fields, row, 0)
+        S2 = load(squares, l, 0)
+        gather(slope, 0, W, 0, begin, count, start, nodes, table)
+        x_advection = splat(0.0)
+        y_advection = splat(0.0)
+        z_advection = splat(0.0)
+        spread = (-m.L * m.kappa_eta) * w
+        held = -1
+        for e in range(first[l] + 1, first[l + 1]):
+            at = e * width
+            to = 0 if held < 0 else 4
+            eta = load(fields, at, 0)
+            store(flow, to, 0, (-m.L * w) * df_deta(eta, rho, S2, m))
+            x_flux = spread * load(fields, at + 1, 0)
+            y_flux = spread * load(fields, at + 2, 0)
+            z_flux = spread * load(fields, at + dim, 0)
+            if rigid:
+                a = particle[e]
+                if a >= 0:
+                    x_swept = eta * x_velocity(motion, a, load(x, 3 * b + 1, 0), load(x, 3 * b + 2, 0))
+                    y_swept = eta * y_velocity(motion, a, load(x, 3 * b, 0), load(x, 3 * b + 2, 0))
+                    z_swept = eta * z_velocity(motion, a, load(x, 3 * b, 0), load(x, 3 * b + 1, 0))
+                else:
+                    fill_velocities(work, motion, owner, e, x, 3 * b)
+                    x_swept = eta * load(work, 0, 0)
+                    y_swept = eta * load(work, 1, 0)
+                    z_swept = eta * load(work, 2, 0)
+                share = eta if huang else splat(1.0)
+                x_flux = x_flux + w * eta * x_swept
+                y_flux = y_flux + w * eta * y_swept
+                z_flux = z_flux + w * eta * z_swept
+                x_advection = x_advection + share * x_swept
+                y_advection = y_advection + share * y_swept
+                z_advection = z_advection + share * z_swept
+            store(flow, to + 1, 0, x_flux)
+            store(flow, to + 2, 0, y_flux)
+            store(flow, to + 3, 0, z_flux)
+            if held < 0:
+                held = e
+            else:
+                scatter_two(rate, column[held], column[e], flow, begin, count, start, nodes, table)
+                held = -1
+        to = 0 if held < 0 else 4
+        D_p = load(D, l, 0)
+        store(flow, to, 0, splat(0.0))
+        store(flow, to + 1, 0, w * (rho * x_advection - D_p * load(slope, 1, 0)))
+        store(flow, to + 2, 0, w * (rho * y_advection - D_p * load(slope, 2, 0)))
+        store(flow, to + 3, 0, w * (rho * z_advection - D_p * load(slope, dim, 0)))
+        if held < 0:
+            scatter(rate, 0, flow, 0, begin, count, start, nodes, table)
+        else:
+            scatter_two(rate, column[held], 0, flow, begin, count, start, nodes, table)
+
+
+@jit
+def to_columns(columns: Floats, u: Floats, listed: Integers) -> None:
+    """columns[c, a] = u[a, c] at the listed nodes."""
+    for c in range(0, u.shape[1], LANES):
+        for i in range(listed.size):
+            a = listed[i]
+            for k in range(LANES):
+                columns[c + k, a] = u[a, c + k]
+
+
+@jit
+def from_columns(u: Floats, columns: Floats, listed: Integers) -> None:
+    """u[a, c] = columns[c, a] at the listed nodes."""
+    for c in range(0, u.shape[1], LANES):
+        for i in range(listed.size):
+            a = listed[i]
+            for k in range(LANES):
+                u[a, c + k] = columns[c + k, a]

@@ -1,0 +1,166 @@
+"""Rows of points that look alike: on a lattice eight neighbouring points see eight neighbouring nodes.
+
+Points of one lattice row have the same shape functions, and where nodes are numbered along x the next point sees the
+next nodes. Eight such points make a block, one lane of a pack each: an entry of the table then serves all eight, and a
+field's values at their eight nodes lie side by side. What a block costs depends on the fields that exist there, not on
+the columns that all particles of the case need. Points without such neighbours (at walls, on other meshes) are loose.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .arrays import Bytes, Flags, Floats, Integers, Numbers
+from .jit import jit
+from .shape import ShapeTable
+from .simd import LANES
+
+MIXED = -2  # in `LiveBlocks.particle`: not one particle in all lanes
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Lane j of block b is points[b, j], -1: nothing is there. The first lane's nodes are nodes[begin[b] + i]."""
+
+    points: Numbers  # (b, LANES)
+    begin: Integers  # (b,) into the nodes of the shape table
+    count: Integers  # (b,) of them
+    start: Integers  # (b,) column of the shape table
+    x: Floats  # (3 b, LANES) row 3 b + k: component k of the points' places, 0 along an axis that is not there
+    loose: Integers  # points in no block
+
+
+@dataclass(frozen=True)
+class LiveBlocks:
+    """The blocks with live points, and the fields that exist there.
+
+    Block blocks[l] has the entries first[l] ... first[l + 1] - 1: rho, and each order parameter that exists in one of
+    its lanes.
+    """
+
+    blocks: Integers  # (L,)
+    weights: Floats  # (L, LANES) w_p of the live points, else 0
+    first: Integers  # (L + 1,)
+    column: Numbers  # (E,) column of u
+    particle: Numbers  # (E,) the particle of all lanes; -1: rho, MIXED: see owner
+    owner: Numbers  # (E, LANES) the particle in each lane, -1: it does not exist there
+    mask: Floats  # (E, LANES) 1 where it exists, else 0
+    partial: Flags  # (E,) whether it is missing in a lane
+
+
+def find_blocks(table: ShapeTable, x: Floats) -> Blocks:
+    """The blocks of a rank's points at x (p, dim), in the order of their first points."""
+    if table.points == 0:
+        none = np.empty(0, dtype=np.int64)
+        return Blocks(np.empty((0, LANES), np.int32), none, none, none, np.empty((0, LANES)), none)
+    order = np.lexsort((table.nodes[table.offsets[:-1]], table.rows)).astype(np.int64)
+    place = np.empty(table.points, dtype=np.int64)
+    number_rows(place, order, table.offsets, table.nodes, table.rows)
+    ends = np.flatnonzero(np.append(place[1:] % LANES == 0, True))
+    starts = np.append(0, ends[:-1] + 1)
+    keep = ends > starts  # a block with one point gains nothing
+    starts, lengths = starts[keep], (ends - starts)[keep] + 1
+    lanes = starts[:, None] + np.arange(LANES)
+    inside = np.arange(LANES) < lengths[:, None]
+    points = np.where(inside, order[np.minimum(lanes, order.size - 1)], -1).astype(np.int32)
+    points = points[np.argsort(points[:, 0], kind="stable")]
+    blocked = np.zeros(table.points, dtype=bool)
+    blocked[points[points >= 0]] = True
+    first = points[:, 0].astype(np.int64)
+    places = np.zeros((len(points), 3, LANES))
+    places[:, : x.shape[1]] = np.where((points >= 0)[:, None], x[points].transpose(0, 2, 1), 0.0)
+    return Blocks(
+        points,
+        table.offsets[first],
+        table.offsets[first + 1] - table.offsets[first],
+        table.rows[first],
+        places.reshape(-1, LANES),
+        np.flatnonzero(~blocked),
+    )
+
+
+@jit
+def number_rows(place: Integers, order: Integers, offsets: Integers, nodes: Numbers, rows: Integers) -> None:
+    """place[i]: how far point order[i] is along its row of points whose nodes follow one another."""
+    place[0] = 0
+    for i in range(1, order.size):
+        p = order[i - 1]
+        q = order[i]
+        follows = rows[p] == rows[q]
+        if follows:
+            for k in range(offsets[p + 1] - offsets[p]):
+                if nodes[offsets[q] + k] != nodes[offsets[p] + k] + 1:
+                    follows = False
+                    break
+        place[i] = place[i - 1] + 1 if follows else 0
+
+
+def live_blocks(blocks: Blocks, flags: Numbers, owner: Numbers, weights: Floats) -> LiveBlocks:
+    """The blocks in which flags (p,) mark a live point; owner (p, slots) as `active.activate` settles it."""
+    chosen = np.flatnonzero(((flags[blocks.points] != 0) & (blocks.points >= 0)).any(axis=1))
+    first = np.zeros(chosen.size + 1, dtype=np.int64)
+    slots = np.zeros((chosen.size, owner.shape[1]), dtype=np.int8)
+    count_entries(first, slots, chosen, blocks.points, flags, owner)
+    np.cumsum(first, out=first)
+    entries = int(first[-1])
+    live = LiveBlocks(
+        chosen,
+        np.zeros((chosen.size, LANES)),
+        first,
+        np.zeros(entries, dtype=np.int32),
+        np.full(entries, -1, dtype=np.int32),
+        np.full((entries, LANES), -1, dtype=np.int32),
+        np.ones((entries, LANES)),
+        np.zeros(entries, dtype=bool),
+    )
+    fill_entries(
+        live.weights, live.column, live.particle, live.owner, live.mask, live.partial,
+        first, slots, chosen, blocks.points, flags, owner, weights,
+    )
+    return live
+
+
+@jit
+def count_entries(
+    first: Integers, slots: Bytes, chosen: Integers, points: Numbers, flags: Numbers, owner: Numbers
+) -> None:
+    """first[l + 1]: the entries of block chosen[l]; slots[l, s] = 1 where one of its live points has slot s."""
+    for l in range(chosen.size):
+        first[l + 1] = 1
+        for j in range(points.shape[1]):
+            p = points[chosen[l], j]
+            if p < 0 or not flags[p]:
+                continue
+            for s in range(owner.shape[1]):
+                if owner[p, s] >= 0 and not slots[l, s]:
+                    slots[l, s] = 1
+                    first[l + 1] += 1
+
+
+@jit
+def fill_entries(
+    weights: Floats, column: Numbers, particle: Numbers, entry_owner: Numbers, mask: Floats, partial: Flags,
+    first: Integers, slots: Bytes, chosen: Integers, points: Numbers, flags: Numbers, owner: Numbers, w: Floats,
+) -> None:
+    """Fill the arrays of `LiveBlocks`; rho's entries stand at their defaults."""
+    for l in range(chosen.size):
+        e = first[l]
+        for j in range(points.shape[1]):
+            p = points[chosen[l], j]
+            weights[l, j] = w[p] if p >= 0 and flags[p] else 0.0
+        for s in range(owner.shape[1]):
+            if not slots[l, s]:
+                continue
+            e += 1
+            column[e] = 1 + s
+            for j in range(points.shape[1]):
+                p = points[chosen[l], j]
+                a = owner[p, s] if p >= 0 and flags[p] else np.int32(-1)
+                entry_owner[e, j] = a
+                if a < 0:
+                    mask[e, j] = 0.0
+                    partial[e] = True
+                elif particle[e] == -1:
+                    particle[e] = a
+                elif particle[e] != a:
+                    particle[e] = MIXED

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import kernels, slots
+from . import block_kernels, kernels, slots
 from .arrays import Flags, Floats, Integers, Numbers
 from .blocks import LiveBlocks, live_blocks
 from .discretisation import WORTH, Discretisation
@@ -18,7 +18,6 @@ from .rigid import rotations
 from .simd import LANES
 from .state import State, width
 
-NEAR = 1e-3  # nodes with a smaller N_a(x_p) do not decide who shares a slot: what they bring is below eps
 LEAST = 3.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
 SLOT_EPS = 0.3  # eps_eta: unit in which an order parameter's growth is measured where it does not exist yet
 
@@ -65,7 +64,8 @@ def activate(d: Discretisation, state: State) -> Active:
     high = np.full(d.nodes, -1, dtype=np.int64)
     kernels.interiors(low, high, flags, owner, state.u, table.offsets, table.nodes, table.rows, table.table)
     _spread(d, low, high)
-    kernels.switch_on(flags, low < high, table.offsets, table.nodes)
+    if (low < high).any():
+        kernels.switch_on(flags, low < high, table.offsets, table.nodes)
     live = np.flatnonzero(flags)
     loose = d.blocks.loose[flags[d.blocks.loose] != 0]
     mask = np.zeros((loose.size, state.u.shape[1]))
@@ -78,7 +78,10 @@ def activate(d: Discretisation, state: State) -> Active:
     moments = np.zeros((len(state.slot_of), 1 + d.dim))
     kernels.add_moments(moments, state.u, still, state.owner, d.mass, d.first_moment)
     watch = np.zeros(d.nodes, dtype=np.int64)
-    kernels.watch_nodes(watch, flags, owner, state.owner, table.offsets, table.nodes, table.rows, table.table)
+    kernels.watch_nodes(
+        watch, flags, owner, state.owner, table.offsets, table.nodes, table.rows, table.table,
+        d.nearest.kind, d.nearest.starts, d.nearest.places,
+    )
     return Active(
         live=live,
         blocks=live_blocks(d.blocks, flags, owner, d.weights),
@@ -151,8 +154,8 @@ def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> 
     """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot."""
     claims = np.full_like(state.owner, -1)
     crowded = np.empty_like(clash)
-    table = d.shape
-    kernels.claim(claims, crowded, owner, NEAR, table.offsets, table.nodes, table.rows, table.table)
+    near = d.nearest
+    kernels.claim(claims, crowded, owner, d.shape.offsets, d.shape.nodes, near.kind, near.starts, near.places)
     mine = claims.copy()
     d.share.halo.most(claims)
     torn = (mine >= 0) & (mine != claims)
@@ -160,13 +163,21 @@ def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> 
 
 
 def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]:
-    table, switch = d.shape, d.case.activation
-    flags = np.empty(table.points, dtype=np.int32)
-    owner = np.empty((table.points, state.owner.shape[1]), dtype=np.int32)
-    clash = np.empty((table.points, 2), dtype=np.int64)
+    table, near, blocks, switch = d.shape, d.nearest, d.blocks, d.case.activation
+    flags = np.zeros(table.points, dtype=np.int32)
+    owner = np.full((table.points, state.owner.shape[1]), -1, dtype=np.int32)
+    clash = np.full((table.points, 2), -1, dtype=np.int64)
+    least = LEAST * switch.eps_eta
     kernels.sense(
-        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, LEAST * switch.eps_eta, NEAR, d.dim,
-        table.offsets, table.nodes, table.rows, table.table,
+        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, least, d.dim, blocks.loose,
+        table.offsets, table.nodes, table.rows, table.table, near.kind, near.starts, near.places,
+    )
+    columns = np.zeros((state.u.shape[1], d.nodes + LANES))
+    block_kernels.to_columns(columns, state.u, np.arange(d.nodes))
+    block_kernels.sense(
+        flags, owner, clash, columns, state.owner, switch.eps_rho, switch.eps_eta, least, blocks.points,
+        blocks.begin, blocks.count, blocks.start, table.offsets, table.nodes, table.table,
+        near.kind, near.starts, near.places,
     )
     return flags, owner, clash
 
@@ -187,7 +198,10 @@ def _spread(d: Discretisation, low: Integers, high: Integers) -> None:
 def _touched(d: Discretisation, chosen: Flags) -> Flags:
     """Which nodes a chosen point of any rank sees."""
     touched = np.zeros(d.nodes, dtype=np.int8)
-    kernels.touch(touched, chosen, d.shape.offsets, d.shape.nodes)
+    if chosen.all():
+        touched[:] = 1  # a rank holds only nodes that its points see
+    elif chosen.any():
+        kernels.touch(touched, chosen, d.shape.offsets, d.shape.nodes)
     d.share.halo.most(touched)
     return touched.astype(bool)
 

@@ -11,7 +11,7 @@ import numpy as np
 from .arrays import Flags, Floats, Integers, Numbers
 from .energy import Coefficients, df_deta, df_drho, mobility
 from .jit import inlined, jit
-from .kernels import touching_share, x_velocity, y_velocity, z_velocity
+from .kernels import find_owner, touching_share, x_velocity, y_velocity, z_velocity
 from .simd import LANES, load, positive, splat, store
 
 
@@ -310,6 +310,53 @@ def divergence(
             scatter(rate, 0, flow, 0, begin, count, start, nodes, table)
         else:
             scatter_two(rate, column[held], 0, flow, begin, count, start, nodes, table)
+
+
+@jit
+def sense(
+    flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, node_owner: Numbers,
+    eps_rho: float, eps_eta: float, least: float, points: Numbers,
+    begins: Integers, counts: Integers, block_starts: Integers, offsets: Integers, nodes: Numbers, table: Floats,
+    kind: Integers, starts: Integers, places: Numbers,
+) -> None:
+    """`kernels.sense` for the points in blocks. Order parameters are 0 where nobody owns their slot."""
+    held = np.zeros(node_owner.shape[0], dtype=np.int64)
+    slots_of_eight(held, node_owner)
+    width = table.shape[0]
+    fields = np.empty((width, LANES))
+    for b in range(points.shape[0]):
+        begin = begins[b]
+        some = np.int64(1)  # bit 0: rho, bit 1 + s: slot s
+        for e in range(begin, begin + counts[b]):
+            some |= held[nodes[e]]
+        for column in range(1 + node_owner.shape[1]):
+            if not some >> column & 1:
+                continue
+            gather(fields, 0, columns, column, begin, counts[b], block_starts[b], nodes, table)
+            eps = eps_rho if column == 0 else eps_eta
+            for j in range(LANES):
+                p = points[b, j]
+                if p < 0:
+                    continue
+                square = 0.0
+                for k in range(1, width):
+                    square += fields[k, j] * fields[k, j]
+                if square >= eps * eps:
+                    flags[p] = 1
+                if column > 0 and (square >= least * least or abs(fields[0, j]) >= least):
+                    find_owner(owner, clash, p, column - 1, node_owner, offsets, nodes, kind, starts, places)
+
+
+@jit
+def slots_of_eight(held: Integers, node_owner: Numbers) -> None:
+    """held[a]: bit 1 + s where slot s is owned at one of the nodes a ... a + LANES - 1."""
+    for a in range(held.size):
+        for s in range(node_owner.shape[1]):
+            if node_owner[a, s] >= 0:
+                held[a] |= np.int64(1) << (1 + s)
+    for a in range(held.size):
+        for j in range(1, min(LANES, held.size - a)):
+            held[a] |= held[a + j]
 
 
 @jit

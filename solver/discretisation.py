@@ -12,11 +12,12 @@ from .energy import Coefficients
 from .geometry import Mesh
 from .neighbours import Grid
 from .partition import Halo, Ranks, Share, bisect
-from .shape import ShapeError, ShapeTable, linear, lme
+from .shape import Nearest, ShapeError, ShapeTable, linear, lme, nearest
 
 # Points rest only where no more than this part of all must live. A boundary between resting and live points costs, too:
 # what moves at it slowly has to be looked after, and each new choice is a small jolt to the steps in time.
 WORTH = 0.6
+NEAR = 1e-3  # nodes with a smaller N_a(x_p) do not decide who shares a slot: what they bring is below eps
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Discretisation:
     share: Share
     shape: ShapeTable
     blocks: Blocks
+    nearest: Nearest
     positions: Floats  # (n, dim) of this rank's nodes, nm
     x: Floats  # (p, dim)
     weights: Floats  # (p,) nm^dim
@@ -80,7 +82,7 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
     return Discretisation(
-        case, share, table, find_blocks(table, x), mesh.nodes[nodes], x, weights, mass, first_moment,
+        case, share, table, find_blocks(table, x), nearest(table, NEAR), mesh.nodes[nodes], x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
 

@@ -414,39 +414,45 @@ def free_energy(
 @jit
 def sense(
     flags: Numbers, owner: Numbers, clash: Integers, u: Floats, node_owner: Numbers,
-    eps_rho: float, eps_eta: float, least: float, near: float, dim: int,
+    eps_rho: float, eps_eta: float, least: float, dim: int, loose: Integers,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+    kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
-    """Mark the points where something happens and name the particles that their slots mean (section 2.4).
+    """Mark the loose points where something happens and name the particles that their slots mean (section 2.4).
 
-    flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s] is the particle found in slot s
-    of the point's nodes with N_a(x_p) >= near, if its eta or |grad eta| is at least `least` here; where there are two,
-    clash[p] = (one, other).
+    flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s], which comes as -1, is the
+    particle found in slot s of the point's nearest nodes, if its eta or |grad eta| is at least `least` here; where
+    there are two, clash[p] = (one, other).
     """
     point = np.empty((1 + dim, u.shape[1]))
-    for p in range(flags.size):
+    for p in loose:
         for column in range(0, u.shape[1], LANES):
             gather(point, u, 0, offsets[p], offsets[p + 1] - offsets[p], rows[p], nodes, table, column)
         flags[p] = steep(point, 0, eps_rho)
-        clash[p, 0] = -1
         for s in range(node_owner.shape[1]):
-            owner[p, s] = -1
             if steep(point, 1 + s, eps_eta):
                 flags[p] = 1
-            if not steep(point, 1 + s, least) and abs(point[0, 1 + s]) < least:
-                continue
-            for i in range(offsets[p + 1] - offsets[p]):
-                if table[0, rows[p] + i] < near:
-                    continue
-                a = node_owner[nodes[offsets[p] + i], s]
-                b = owner[p, s]
-                if a >= 0 and b >= 0 and a != b:
-                    clash[p, 0] = min(a, b)
-                    clash[p, 1] = max(a, b)
-                owner[p, s] = max(a, b)
+            if steep(point, 1 + s, least) or abs(point[0, 1 + s]) >= least:
+                find_owner(owner, clash, p, s, node_owner, offsets, nodes, kind, starts, places)
 
 
-@jit
+@inlined
+def find_owner(
+    owner: Numbers, clash: Integers, p: int, s: int, node_owner: Numbers,
+    offsets: Integers, nodes: Numbers, kind: Integers, starts: Integers, places: Numbers,
+) -> None:
+    """owner[p, s] = the particle in slot s of the point's nearest nodes; see `sense`."""
+    found = owner[p, s]
+    for e in range(starts[kind[p]], starts[kind[p] + 1]):
+        a = node_owner[nodes[offsets[p] + places[e]], s]
+        if a >= 0 and found >= 0 and a != found:
+            clash[p, 0] = min(a, found)
+            clash[p, 1] = max(a, found)
+        found = max(a, found)
+    owner[p, s] = found
+
+
+@inlined
 def steep(point: Floats, column: int, eps: float) -> bool:
     """Whether the gradient of a field at a point is at least eps."""
     square = 0.0
@@ -457,12 +463,12 @@ def steep(point: Floats, column: int, eps: float) -> bool:
 
 @jit
 def claim(
-    node_owner: Numbers, clash: Integers, owner: Numbers, near: float,
-    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+    node_owner: Numbers, clash: Integers, owner: Numbers,
+    offsets: Integers, nodes: Numbers, kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
     """Let the particles claim the nodes of every point at which they exist: where they are, and a ring to grow into.
 
-    Nodes with N_a(x_p) < near do not count. Where a node's slot is already another particle's, clash[p] = (one, other).
+    Only a point's nearest nodes count. Where a node's slot is another particle's already, clash[p] = (one, other).
     """
     for p in range(owner.shape[0]):
         clash[p, 0] = -1
@@ -470,10 +476,8 @@ def claim(
             a = owner[p, s]
             if a < 0:
                 continue
-            for i in range(offsets[p + 1] - offsets[p]):
-                if table[0, rows[p] + i] < near:
-                    continue
-                node = nodes[offsets[p] + i]
+            for e in range(starts[kind[p]], starts[kind[p] + 1]):
+                node = nodes[offsets[p] + places[e]]
                 holder = node_owner[node, s]
                 if holder < 0:
                     node_owner[node, s] = a
@@ -515,14 +519,9 @@ def interior_slot(
 
 @jit
 def watch_nodes(
-    watch: Integers,
-    flags: Numbers,
-    owner: Numbers,
-    node_owner: Numbers,
-    offsets: Integers,
-    nodes: Numbers,
-    rows: Integers,
-    table: Floats,
+    watch: Integers, flags: Numbers, owner: Numbers, node_owner: Numbers,
+    offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
+    kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
     """watch[a]: bit 0 where a switched-off point needs node a, bit 1 + s where a live point near it lacks slot s.
 
@@ -530,13 +529,14 @@ def watch_nodes(
     N_a(x_p) is at least 2 %: farther ones say little of the slot's value at the point.
     """
     for p in range(flags.size):
-        for i in range(offsets[p + 1] - offsets[p]):
-            a = nodes[offsets[p] + i]
-            if not flags[p]:
-                watch[a] |= 1
-                continue
-            if table[0, rows[p] + i] < 0.02:
-                continue
+        if not flags[p]:
+            for e in range(offsets[p], offsets[p + 1]):
+                watch[nodes[e]] |= 1
+            continue
+        for e in range(starts[kind[p]], starts[kind[p] + 1]):
+            if table[0, rows[p] + places[e]] < 0.02:
+                break
+            a = nodes[offsets[p] + places[e]]
             for s in range(owner.shape[1]):
                 if node_owner[a, s] >= 0 and owner[p, s] != node_owner[a, s]:
                     watch[a] |= np.int64(1) << (1 + s)

@@ -54,6 +54,45 @@ class ShapeTable:
         return self.table[:, np.repeat(self.rows - self.offsets[:-1], counts) + np.arange(self.nodes.size)]
 
 
+@dataclass(frozen=True)
+class Nearest:
+    """The nodes that count most: point p's are nodes[offsets[p] + places[e]], starts[kind[p]] <= e < starts[kind[p] + 1].
+
+    They are in the order of falling N. kind (p,), starts (kinds + 1,), places: points that share rows share these.
+    """
+
+    kind: Integers
+    starts: Integers
+    places: Numbers
+
+
+def nearest(table: ShapeTable, least: float) -> Nearest:
+    """The nodes with N_a(x_p) >= least."""
+    rows, first, kind = np.unique(table.rows, return_index=True, return_inverse=True)
+    counts = np.diff(table.offsets)[first]
+    starts = np.zeros(rows.size + 1, dtype=np.int64)
+    none = np.empty(0, dtype=np.int32)
+    choose(none, starts, rows, counts, table.table, least)
+    np.cumsum(starts, out=starts)
+    places = np.empty(int(starts[-1]), dtype=np.int32)
+    choose(places, starts, rows, counts, table.table, least)
+    return Nearest(kind.astype(np.int64), starts, places)
+
+
+@jit
+def choose(places: Numbers, starts: Integers, rows: Integers, counts: Integers, table: Floats, least: float) -> None:
+    """Count the entries of at least `least` of row r into starts[r + 1] where `places` is empty, else write them."""
+    for r in range(rows.size):
+        order = np.argsort(-table[0, rows[r] : rows[r] + counts[r]])
+        for i in range(counts[r]):
+            if table[0, rows[r] + order[i]] < least:
+                break
+            if places.size:
+                places[starts[r] + i] = order[i]
+            else:
+                starts[r + 1] += 1
+
+
 def row_offsets(counts: Integers) -> Integers:
     """The starts of rows of the given lengths, and the end of the last."""
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])

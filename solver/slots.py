@@ -99,13 +99,17 @@ def move(new_u: Floats, new_owner: Numbers, u: Floats, owner: Numbers, slot_of: 
 def meeting(owner: Numbers, chosen: Integers) -> Integers:
     """Every pair of particles that one of the chosen rows of owner holds together, once: (pairs, 2)."""
     seen = {np.int64(-1)}
+    last = np.int64(-1)
     for p in chosen:
         for s in range(owner.shape[1]):
             for t in range(s):
                 a = np.int64(owner[p, s])
                 b = np.int64(owner[p, t])
                 if a >= 0 and b >= 0:
-                    seen.add(min(a, b) << 32 | max(a, b))
+                    code = min(a, b) << 32 | max(a, b)
+                    if code != last:  # mostly it is the pair of the row before
+                        seen.add(code)
+                        last = code
     pairs = np.empty((len(seen) - 1, 2), dtype=np.int64)
     count = 0
     for code in seen:

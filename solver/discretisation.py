@@ -17,6 +17,8 @@ from .shape import Nearest, ShapeError, ShapeTable, linear, lme, nearest
 # Points rest only where no more than this part of all must live. A boundary between resting and live points costs, too:
 # what moves at it slowly has to be looked after, and each new choice is a small jolt to the steps in time.
 WORTH = 0.6
+FIXED_WORK = 1.0  # of a live point, in units of the work for one field: W goes to the nodes and back
+RESTING_WORK = 0.1
 NEAR = 1e-3  # nodes with a smaller N_a(x_p) do not decide who shares a slot: what they bring is below eps
 
 
@@ -101,10 +103,11 @@ def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:
 
 
 def activity(mesh: Mesh, u: Floats, eps: float) -> Floats:
-    """Expected work of each point (p,): 1 where a field varies over its cell by more than eps per nm, else 0.05.
+    """Expected work of each point (p,): `FIXED_WORK` and the fields that exist there, or `RESTING_WORK` where it rests.
 
-    Where resting does not pay (`WORTH`) all points live.
+    A point rests where no field varies over its cell by more than eps per nm. Where resting does not pay (`WORTH`) all
+    points live.
     """
-    varies = np.zeros(len(mesh.cells), dtype=bool)
-    kernels.variation(varies, mesh.cells, u, eps * mesh.spacing)
-    return np.where(varies | (varies.mean() > WORTH), 1.0, 0.05)
+    varies, fields = np.zeros(len(mesh.cells), dtype=bool), np.zeros(len(mesh.cells), dtype=np.int32)
+    kernels.variation(varies, fields, mesh.cells, u, eps * mesh.spacing, eps)
+    return np.where(varies | (varies.mean() > WORTH), FIXED_WORK + fields, RESTING_WORK)

@@ -674,8 +674,8 @@ def renumber(nodes: Numbers, new: Numbers) -> None:
 
 
 @jit
-def variation(varies: Flags, cells: Numbers, u: Floats, least: Floats) -> None:
-    """varies[c]: whether a field differs by more than least[c] between two corners of cell c."""
+def variation(varies: Flags, fields: Numbers, cells: Numbers, u: Floats, least: Floats, eps: float) -> None:
+    """Of each cell c: whether a field differs by more than least[c] between two corners; and how many exceed eps."""
     for c in range(cells.shape[0]):
         for column in range(u.shape[1]):
             low = u[cells[c, 0], column]
@@ -683,9 +683,8 @@ def variation(varies: Flags, cells: Numbers, u: Floats, least: Floats) -> None:
             for k in range(1, cells.shape[1]):
                 low = min(low, u[cells[c, k], column])
                 high = max(high, u[cells[c, k], column])
-            if high - low > least[c]:
-                varies[c] = True
-                break
+            varies[c] |= high - low > least[c]
+            fields[c] += high > eps
 
 
 @jit

@@ -76,7 +76,8 @@ def mpi_library() -> str:
 def bisect(points: Floats, weights: Floats, parts: int) -> Integers:
     """The part (0 ... parts - 1) of each point: cut at the weighted median across the longest side, and again.
 
-    points (p, dim), weights (p,) > 0. Parts differ in weight by about one point; the result is the same everywhere.
+    points (p, dim), weights (p,) > 0. Parts differ in weight by about one point; the result is the same everywhere. Of
+    sides as long as each other the last is cut: whole rows along x make whole `blocks`.
     """
     part = np.zeros(len(points), dtype=np.int64)
     todo = [(np.arange(len(points)), 0, parts)]
@@ -87,7 +88,8 @@ def bisect(points: Floats, weights: Floats, parts: int) -> Integers:
             continue
         left = count // 2
         extent = np.ptp(points[chosen], axis=0)
-        chosen = chosen[np.argsort(points[chosen, int(np.argmax(extent))], kind="stable")]
+        axis = int(np.flatnonzero(extent >= 0.99 * extent.max())[-1])
+        chosen = chosen[np.argsort(points[chosen, axis], kind="stable")]
         heavy = np.cumsum(weights[chosen])
         cut = int(np.searchsorted(heavy, heavy[-1] * left / count))
         cut = min(max(cut, left), len(chosen) - (count - left))

@@ -118,9 +118,13 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
     choosing again for the same state gives the same.
     """
     known = np.empty((0, 2), dtype=np.int64)
-    compact = True
+    compact, points = True, d.shape.points
+    flags = np.zeros(points, dtype=np.int32)
+    owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
+    clash = np.full((points, 2), -1, dtype=np.int64)
+    changed = np.ones(d.nodes, dtype=bool)  # nodes whose values or owners a point has not been asked about yet
     while True:
-        flags, owner, clash = _sense(d, state)
+        _sense(d, state, flags, owner, clash, changed)
         if not d.case.activation.enabled:
             flags[:] = 1
         if not d.case.activation.few_order_parameters:
@@ -135,19 +139,26 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
         slot_of = state.slot_of
         if len(clashes):
             slot_of = slots.recolour(slot_of, known)
+            if width(int(slot_of.max()) + 1) > state.u.shape[1]:
+                slot_of = slots.colour(known, len(slot_of))
         elif compact and state.u.shape[1] > LANES:
             slot_of = slots.colour(known, len(slot_of))
             compact = False
         columns = width(int(slot_of.max()) + 1)
         if not len(clashes) and columns >= state.u.shape[1]:
-            changed = np.array([float((claims != state.owner).any())])
+            changed = (claims != state.owner).any(axis=1)
             state.owner = claims
             state.eta[claims < 0] = 0.0
-            if d.share.ranks.max(changed)[0] == 0.0:
+            if d.share.ranks.max(np.array([float(changed.any())]))[0] == 0.0:
                 return flags, owner
             continue
-        state.slot_of = slot_of
+        before, state.slot_of = state.owner, slot_of
         state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
+        if state.owner.shape == before.shape:
+            changed = (state.owner != before).any(axis=1)
+        else:
+            changed = np.ones(d.nodes, dtype=bool)
+            owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
 
 
 def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:
@@ -162,24 +173,21 @@ def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> 
     return claims, np.concatenate([clash, crowded, np.stack([mine[torn], claims[torn]], axis=1)])
 
 
-def _sense(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers]:
+def _sense(d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers, changed: Flags) -> None:
+    """Fill flags, owner and clash at the points that see a changed node; see `kernels.sense`."""
     table, near, blocks, switch = d.shape, d.nearest, d.blocks, d.case.activation
-    flags = np.zeros(table.points, dtype=np.int32)
-    owner = np.full((table.points, state.owner.shape[1]), -1, dtype=np.int32)
-    clash = np.full((table.points, 2), -1, dtype=np.int64)
     least = LEAST * switch.eps_eta
     kernels.sense(
-        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, least, d.dim, blocks.loose,
+        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, least, d.dim, blocks.loose, changed,
         table.offsets, table.nodes, table.rows, table.table, near.kind, near.starts, near.places,
     )
     columns = np.zeros((state.u.shape[1], d.nodes + LANES))
     block_kernels.to_columns(columns, state.u, np.arange(d.nodes))
     block_kernels.sense(
-        flags, owner, clash, columns, state.owner, switch.eps_rho, switch.eps_eta, least, blocks.points,
+        flags, owner, clash, columns, state.owner, switch.eps_rho, switch.eps_eta, least, blocks.points, changed,
         blocks.begin, blocks.count, blocks.start, table.offsets, table.nodes, table.table,
         near.kind, near.starts, near.places,
     )
-    return flags, owner, clash
 
 
 def _everyones_pairs(d: Discretisation, pairs: Integers) -> Integers:

@@ -315,22 +315,31 @@ def divergence(
 @jit
 def sense(
     flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, node_owner: Numbers,
-    eps_rho: float, eps_eta: float, least: float, points: Numbers,
+    eps_rho: float, eps_eta: float, least: float, points: Numbers, changed: Flags,
     begins: Integers, counts: Integers, block_starts: Integers, offsets: Integers, nodes: Numbers, table: Floats,
     kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
     """`kernels.sense` for the points in blocks. Order parameters are 0 where nobody owns their slot."""
     held = np.zeros(node_owner.shape[0], dtype=np.int64)
-    slots_of_eight(held, node_owner)
+    slots_of_eight(held, node_owner, changed)
     width = table.shape[0]
     fields = np.empty((width, LANES))
     for b in range(points.shape[0]):
         begin = begins[b]
-        some = np.int64(1)  # bit 0: rho, bit 1 + s: slot s
+        some = np.int64(0)
         for e in range(begin, begin + counts[b]):
             some |= held[nodes[e]]
+        if not some & 1:
+            continue
+        for j in range(LANES):
+            p = points[b, j]
+            if p >= 0:
+                flags[p] = 0
+                clash[p, 0] = -1
+                for s in range(node_owner.shape[1]):
+                    owner[p, s] = -1
         for column in range(1 + node_owner.shape[1]):
-            if not some >> column & 1:
+            if column > 0 and not some >> column & 1:
                 continue
             gather(fields, 0, columns, column, begin, counts[b], block_starts[b], nodes, table)
             eps = eps_rho if column == 0 else eps_eta
@@ -348,9 +357,10 @@ def sense(
 
 
 @jit
-def slots_of_eight(held: Integers, node_owner: Numbers) -> None:
-    """held[a]: bit 1 + s where slot s is owned at one of the nodes a ... a + LANES - 1."""
+def slots_of_eight(held: Integers, node_owner: Numbers, changed: Flags) -> None:
+    """held[a], of the nodes a ... a + LANES - 1: bit 0 if one has changed, bit 1 + s if slot s is owned at one."""
     for a in range(held.size):
+        held[a] = changed[a]
         for s in range(node_owner.shape[1]):
             if node_owner[a, s] >= 0:
                 held[a] |= np.int64(1) << (1 + s)

@@ -414,22 +414,31 @@ def free_energy(
 @jit
 def sense(
     flags: Numbers, owner: Numbers, clash: Integers, u: Floats, node_owner: Numbers,
-    eps_rho: float, eps_eta: float, least: float, dim: int, loose: Integers,
+    eps_rho: float, eps_eta: float, least: float, dim: int, loose: Integers, changed: Flags,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
     kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
     """Mark the loose points where something happens and name the particles that their slots mean (section 2.4).
 
-    flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta. owner[p, s], which comes as -1, is the
-    particle found in slot s of the point's nearest nodes, if its eta or |grad eta| is at least `least` here; where
-    there are two, clash[p] = (one, other).
+    flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta, else 0. owner[p, s] is the particle found in
+    slot s of the point's nearest nodes, if its eta or |grad eta| is at least `least` here, else -1; where there are two,
+    clash[p] = (one, other), else -1. Points that see no changed node are left as they are.
     """
     point = np.empty((1 + dim, u.shape[1]))
     for p in loose:
+        ask = False
+        for e in range(offsets[p], offsets[p + 1]):
+            if changed[nodes[e]]:
+                ask = True
+                break
+        if not ask:
+            continue
+        clash[p, 0] = -1
         for column in range(0, u.shape[1], LANES):
             gather(point, u, 0, offsets[p], offsets[p + 1] - offsets[p], rows[p], nodes, table, column)
         flags[p] = steep(point, 0, eps_rho)
         for s in range(node_owner.shape[1]):
+            owner[p, s] = -1
             if steep(point, 1 + s, eps_eta):
                 flags[p] = 1
             if steep(point, 1 + s, least) or abs(point[0, 1 + s]) >= least:

@@ -22,7 +22,7 @@ import numpy as np
 from . import checkpoint, output, slots
 from .arrays import Floats
 from .case import Case, CaseError, load_case
-from .checkpoint import CheckpointError
+from .checkpoint import Checkpoint, CheckpointError
 from .geometry import Mesh, MeshError
 from .integrators import Integrator
 from .observe import Observables
@@ -30,7 +30,7 @@ from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
 from .prepare import build_mesh, make_integrator, prepare
-from .run import RunError, run
+from .run import Ending, RunError, run
 from .scheme import Scheme
 from .shape import ShapeError
 from .state import State
@@ -106,6 +106,31 @@ def execute(
     rows = fresh or ranks.from_root(checkpoint.by_rows(directory) if ranks.root else None)
     mesh, identity = build_mesh(case, ranks, rows), asked.identity()
     kept = None if fresh else ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
+    scheme, state, integrator = start(case, mesh, ranks, kept)
+    if ranks.root:
+        record_start(directory, asked, ranks.size, fresh, packing)
+    while True:
+        wall_time = kept.wall_time if kept else None
+        recorder = Recorder(directory, mesh, scheme, state, identity, wall_time, requests, arguments.progress)
+        try:
+            ending = run(scheme, state, integrator, recorder)
+            recorder.checkpoint(scheme, state, integrator)
+        except (RunError, FloatingPointError) as error:
+            return "failed", f"{error}; the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
+        finally:
+            recorder.close()
+        if ending is Ending.DONE:
+            return "done", None
+        if ending is Ending.STOPPED:
+            return "interrupted", f"checkpoint at t = {state.time:.6g}"
+        del scheme, state, recorder  # the mesh is divided anew: the run goes on from the checkpoint
+        ranks.watch.enter("set-up")
+        kept = ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
+        scheme, state, integrator = start(case, mesh, ranks, kept)
+
+
+def start(case: Case, mesh: Mesh, ranks: Ranks, kept: Checkpoint | None) -> tuple[Scheme, State, Integrator]:
+    """Scheme, state and integrator of a fresh run, or of one that goes on from a checkpoint. Collective."""
     scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
     if kept:
         nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
@@ -114,19 +139,7 @@ def execute(
         )
         if kept.motion is not None:
             scheme.motion = kept.motion
-    integrator = make_integrator(case, mesh, kept.memory if kept else None)
-    if ranks.root:
-        record_start(directory, asked, ranks.size, fresh, packing)
-    wall_time = kept.wall_time if kept else None
-    recorder = Recorder(directory, mesh, scheme, state, identity, wall_time, requests, arguments.progress)
-    try:
-        finished = run(scheme, state, integrator, recorder)
-        recorder.checkpoint(scheme, state, integrator)
-    except (RunError, FloatingPointError) as error:
-        return "failed", f"{error}; the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
-    finally:
-        recorder.close()
-    return ("done", None) if finished else ("interrupted", f"checkpoint at t = {state.time:.6g}")
+    return scheme, state, make_integrator(case, mesh, kept.memory if kept else None)
 
 
 def place_or_stop(

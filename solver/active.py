@@ -13,7 +13,7 @@ import numpy as np
 from . import block_kernels, kernels, slots
 from .arrays import Flags, Floats, Integers, Numbers
 from .blocks import LiveBlocks, live_blocks
-from .discretisation import WORTH, Discretisation
+from .discretisation import FIXED_WORK, WORTH, Discretisation
 from .rigid import rotations
 from .simd import LANES
 from .state import State, width
@@ -28,12 +28,15 @@ class Active:
 
     live: Integers  # numbers of the live points
     blocks: LiveBlocks  # those of them that are in blocks
-    loose: Integers  # (L,) numbers of those that are not
+    loose: Integers  # (L,) numbers of those that are not, the first `loose_border` of them at the border of the rank
+    loose_border: int
     owner: Numbers  # (L, slots) particle of each slot at the loose points, -1: none
     mask: Floats  # (L, F) 1 for rho and the slots that exist at the loose points, else 0
     present: Flags  # (L, F / LANES) packs of columns that hold anything
     several: Flags  # (L,) points that see more than one particle
     nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
+    shared: Integers  # those of them that other ranks hold, too
+    inner: Integers  # the others
     owned: Integers  # those of them that this rank owns
     pairs: Integers  # (pairs, 2) particles a < b that a live point of any rank sees together
     potential: Floats  # (n,) what this rank's still points owe to W, times m_a
@@ -44,6 +47,14 @@ class Active:
     reference: Floats  # (n, F) the fields when the set was made
     watched: Integers  # nodes whose values decide whether the set still holds
     watch: Integers  # (n,) which of their fields, see `kernels.watch_nodes`
+
+    def work(self) -> float:
+        """What an evaluation costs on this rank, in units of one field of one block.
+
+        A loose point takes twice that for each pack: its sums wait for each other, and fields that are not there count.
+        """
+        blocks = FIXED_WORK * self.blocks.blocks.size + self.blocks.column.size
+        return float(blocks + 2.0 * (FIXED_WORK * self.loose.size + self.present.sum()))
 
     def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
         """Largest movement of a watched value, in units of its eps; `run.LAG` says when it is too much."""
@@ -86,11 +97,14 @@ def activate(d: Discretisation, state: State) -> Active:
         live=live,
         blocks=live_blocks(d.blocks, flags, owner, d.weights),
         loose=loose,
+        loose_border=int((flags[d.blocks.loose[: d.blocks.loose_border]] != 0).sum()),
         owner=owner[loose],
         mask=mask,
         present=(mask != 0.0).reshape(loose.size, mask.shape[1] // LANES, LANES).any(axis=2),
         several=mask.sum(axis=1) > 2.0,
         nodes=np.flatnonzero(moving),
+        shared=d.share.halo.shared[moving[d.share.halo.shared]],
+        inner=np.setdiff1d(np.flatnonzero(moving), d.share.halo.shared, assume_unique=True),
         owned=d.share.owned[moving[d.share.owned]],
         pairs=_everyones_pairs(d, slots.meeting(owner, live)),
         potential=potential,
@@ -114,8 +128,7 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
     """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks.
 
     Particles that clash move to other slots until none does. What has been seen to meet stays known, so this ends.
-    Where the particles then need fewer packs of slots than there are, all are dealt out anew. The end is a fixed point:
-    choosing again for the same state gives the same.
+    Where the particles then need fewer packs of slots than there are, all are dealt out anew.
     """
     known = np.empty((0, 2), dtype=np.int64)
     compact, points = True, d.shape.points
@@ -146,12 +159,9 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             compact = False
         columns = width(int(slot_of.max()) + 1)
         if not len(clashes) and columns >= state.u.shape[1]:
-            changed = (claims != state.owner).any(axis=1)
             state.owner = claims
             state.eta[claims < 0] = 0.0
-            if d.share.ranks.max(np.array([float(changed.any())]))[0] == 0.0:
-                return flags, owner
-            continue
+            return flags, owner
         before, state.slot_of = state.owner, slot_of
         state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
         if state.owner.shape == before.shape:

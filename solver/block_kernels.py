@@ -131,18 +131,20 @@ def scatter_two(
 
 @jit
 def potential(
-    W: Floats, touching: Integers, touches: int, fields: Floats, D: Floats, squares: Floats, columns: Floats,
+    W: Floats, touching: Integers, fields: Floats, D: Floats, squares: Floats, columns: Floats,
     blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, mask: Floats, partial: Flags,
     begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats, m: Coefficients,
+    low: int, high: int, touches: int,
 ) -> int:
-    """First half of an evaluation, as `kernels.potential`: fields, D and S2 of the live blocks, their shares of W.
+    """First half of an evaluation, as `kernels.potential`: fields, D and S2 of live blocks low ... high - 1.
 
-    W (1, n + LANES); touching gets -1 - (LANES l + j) for lane j of block l; returned: `touches` and those.
+    W (1, n + LANES) gets their shares. touching gets -1 - (LANES l + j) for lane j of block l where particles may
+    touch; returned: `touches` and those.
     """
     width = table.shape[0]
     overlaps = np.empty((1, LANES))
     flow = np.empty((4, LANES))
-    for l in range(blocks.size):
+    for l in range(low, high):
         b = blocks[l]
         begin = begins[b]
         count = counts[b]
@@ -241,9 +243,9 @@ def divergence(
     rate: Floats, fields: Floats, D: Floats, squares: Floats, W: Floats, motion: Floats,
     blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, particle: Numbers, owner: Numbers,
     x: Floats, begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats,
-    m: Coefficients, rigid: bool, huang: bool,
+    m: Coefficients, rigid: bool, huang: bool, low: int, high: int,
 ) -> None:
-    """Second half of an evaluation, as `kernels.divergence`: fluxes of the live blocks, scattered to rate (F, n + 8).
+    """Second half, as `kernels.divergence`: fluxes of live blocks low ... high - 1, scattered to rate (F, n + LANES).
 
     """
     width = table.shape[0]
@@ -251,7 +253,7 @@ def divergence(
     slope = np.empty((width, LANES))
     work = np.empty((3, LANES))
     flow = np.empty((8, LANES))
-    for l in range(blocks.size):
+    for l in range(low, high):
         b = blocks[l]
         begin = begins[b]
         count = counts[b]
@@ -380,10 +382,10 @@ def to_columns(columns: Floats, u: Floats, listed: Integers) -> None:
 
 
 @jit
-def from_columns(u: Floats, columns: Floats, listed: Integers) -> None:
-    """u[a, c] = columns[c, a] at the listed nodes."""
+def add_columns(u: Floats, columns: Floats, listed: Integers) -> None:
+    """u[a, c] += columns[c, a] at the listed nodes."""
     for c in range(0, u.shape[1], LANES):
         for i in range(listed.size):
             a = listed[i]
             for k in range(LANES):
-                u[a, c + k] = columns[c + k, a]
+                u[a, c + k] += columns[c + k, a]

@@ -27,7 +27,9 @@ class Blocks:
     count: Integers  # (b,) of them
     start: Integers  # (b,) column of the shape table
     x: Floats  # (3 b, LANES) row 3 b + k: component k of the points' places, 0 along an axis that is not there
-    loose: Integers  # points in no block
+    border: Flags  # (b,) whether its points see a node that another rank holds, too
+    loose: Integers  # points in no block, those that see such a node first
+    loose_border: int  # how many of them do
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ class LiveBlocks:
     its lanes.
     """
 
-    blocks: Integers  # (L,)
+    blocks: Integers  # (L,) the first `border` of them lie there: see `Blocks.border`
+    border: int
     weights: Floats  # (L, LANES) w_p of the live points, else 0
     first: Integers  # (L + 1,)
     column: Numbers  # (E,) column of u
@@ -48,11 +51,11 @@ class LiveBlocks:
     partial: Flags  # (E,) whether it is missing in a lane
 
 
-def find_blocks(table: ShapeTable, x: Floats) -> Blocks:
-    """The blocks of a rank's points at x (p, dim), in the order of their first points."""
+def find_blocks(table: ShapeTable, x: Floats, shared: Flags) -> Blocks:
+    """The blocks of a rank's points at x (p, dim), in the order of their first points; shared (n,): nodes of others."""
     if table.points == 0:
-        none = np.empty(0, dtype=np.int64)
-        return Blocks(np.empty((0, LANES), np.int32), none, none, none, np.empty((0, LANES)), none)
+        none, no = np.empty(0, dtype=np.int64), np.empty(0, dtype=bool)
+        return Blocks(np.empty((0, LANES), np.int32), none, none, none, np.empty((0, LANES)), no, none, 0)
     order = np.lexsort((table.nodes[table.offsets[:-1]], table.rows)).astype(np.int64)
     place = np.empty(table.points, dtype=np.int64)
     number_rows(place, order, table.offsets, table.nodes, table.rows)
@@ -67,6 +70,9 @@ def find_blocks(table: ShapeTable, x: Floats) -> Blocks:
     blocked = np.zeros(table.points, dtype=bool)
     blocked[points[points >= 0]] = True
     first = points[:, 0].astype(np.int64)
+    border = np.zeros(table.points, dtype=bool)
+    see(border, shared, table.offsets, table.nodes)
+    loose = np.flatnonzero(~blocked)
     places = np.zeros((len(points), 3, LANES))
     places[:, : x.shape[1]] = np.where((points >= 0)[:, None], x[points].transpose(0, 2, 1), 0.0)
     return Blocks(
@@ -75,8 +81,20 @@ def find_blocks(table: ShapeTable, x: Floats) -> Blocks:
         table.offsets[first + 1] - table.offsets[first],
         table.rows[first],
         places.reshape(-1, LANES),
-        np.flatnonzero(~blocked),
+        np.asarray((border[points] & (points >= 0)).any(axis=1)),
+        np.concatenate([loose[border[loose]], loose[~border[loose]]]),
+        int(border[loose].sum()),
     )
+
+
+@jit
+def see(border: Flags, shared: Flags, offsets: Integers, nodes: Numbers) -> None:
+    """border[p]: whether point p sees a shared node."""
+    for p in range(border.size):
+        for e in range(offsets[p], offsets[p + 1]):
+            if shared[nodes[e]]:
+                border[p] = True
+                break
 
 
 @jit
@@ -98,6 +116,8 @@ def number_rows(place: Integers, order: Integers, offsets: Integers, nodes: Numb
 def live_blocks(blocks: Blocks, flags: Numbers, owner: Numbers, weights: Floats) -> LiveBlocks:
     """The blocks in which flags (p,) mark a live point; owner (p, slots) as `active.activate` settles it."""
     chosen = np.flatnonzero(((flags[blocks.points] != 0) & (blocks.points >= 0)).any(axis=1))
+    border = blocks.border[chosen]
+    chosen = np.concatenate([chosen[border], chosen[~border]])
     first = np.zeros(chosen.size + 1, dtype=np.int64)
     slots = np.zeros((chosen.size, owner.shape[1]), dtype=np.int8)
     count_entries(first, slots, chosen, blocks.points, flags, owner)
@@ -105,6 +125,7 @@ def live_blocks(blocks: Blocks, flags: Numbers, owner: Numbers, weights: Floats)
     entries = int(first[-1])
     live = LiveBlocks(
         chosen,
+        int(border.sum()),
         np.zeros((chosen.size, LANES)),
         first,
         np.zeros(entries, dtype=np.int32),

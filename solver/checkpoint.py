@@ -18,7 +18,8 @@ from .state import State
 
 NAME = "checkpoint.h5"
 FORMAT = 3
-READABLE = (1, 2, 3)  # 1 lacks the rigid motion; in 1 and 2 the nodes of a lattice follow the space-filling curve
+READABLE = (1, 2, 3)  # 1 lacks the rigid motion; in 1 and 2 the nodes of a lattice follow the space-filling curve, and
+# the state in which the live points were chosen is that after the choice, which is not made better by another one
 
 
 class CheckpointError(RuntimeError):
@@ -27,7 +28,7 @@ class CheckpointError(RuntimeError):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A state on all nodes, and the state in which the live points were last chosen.
+    """A state on all nodes, and the state from which the live points were last chosen.
 
     Choosing them again at `reference` and going on from `state` repeats what an uninterrupted run does.
     """
@@ -49,11 +50,12 @@ def write(
     fields = {
         "u": collector.whole(state.u),
         "owner": collector.whole(state.owner),
-        "reference": collector.whole(scheme.active.reference),
+        "reference": collector.whole(scheme.before.u),
+        "reference_owner": collector.whole(scheme.before.owner),
     }
     if not scheme.d.share.ranks.root:
         return
-    fields |= {"slot_of": state.slot_of, "motion": scheme.carried}
+    fields |= {"slot_of": state.slot_of, "reference_slot_of": scheme.before.slot_of, "motion": scheme.carried}
     beside = directory / (NAME + ".new")
     with h5py.File(beside, "w") as file:
         for name, values in fields.items():
@@ -83,7 +85,8 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
         raise CheckpointError(f"{path}: the mesh has changed since: {then} nodes then, {len(mesh.nodes)} now")
     counts = float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])
     state = State(*counts, values["u"], values["owner"], values["slot_of"])
-    reference = State(*counts, values["reference"], values["owner"], values["slot_of"])
+    chosen_from = [values.get(f"reference_{name}", values[name]) for name in ("owner", "slot_of")]
+    reference = State(*counts, values["reference"], *chosen_from)
     return Checkpoint(state, reference, notes["memory"], values.get("motion"), notes["wall_time"])
 
 

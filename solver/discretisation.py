@@ -80,11 +80,14 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     weights = np.ascontiguousarray(mesh.weights[points])
     mass, first_moment = np.zeros(nodes.size), np.zeros((nodes.size, x.shape[1]))
     kernels.nodal_moments(mass, first_moment, weights, x, table.offsets, table.nodes, table.rows, table.table)
+    shared = np.zeros(nodes.size, dtype=bool)
+    shared[share.halo.shared] = True
     share.halo.add(mass)
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
     return Discretisation(
-        case, share, table, find_blocks(table, x), nearest(table, NEAR), mesh.nodes[nodes], x, weights, mass, first_moment,
+        case, share, table, find_blocks(table, x, shared), nearest(table, NEAR),
+        mesh.nodes[nodes], x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
 

@@ -114,15 +114,15 @@ def potential(
     W: Floats, touching: Integers, point: Floats, D: Floats, squares: Floats, u: Floats,
     loose: Integers, mask: Floats, present: Flags, several: Flags, weights: Floats,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients,
+    low: int, high: int, touches: int,
 ) -> int:
-    """First half of an evaluation: fields at the loose live points, D, their shares of W; how many points touch.
+    """First half of an evaluation: fields and D at the points loose[low] ... loose[high - 1], and their shares of W.
 
-    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching from its start with the l of the points
-    where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2.
+    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching from `touches` on with the l of the
+    points where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2. Returned: `touches` and those.
     """
     width = table.shape[0]
-    touches = 0
-    for l in range(loose.size):
+    for l in range(low, high):
         p = loose[l]
         row = l * width
         begin = offsets[p]
@@ -340,9 +340,9 @@ def divergence(
     rate: Floats, point: Floats, D: Floats, squares: Floats, W: Floats, motion: Floats, velocity: Floats,
     loose: Integers, owner: Numbers, present: Flags, weights: Floats, x: Floats,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats,
-    m: Coefficients, rigid: bool, huang: bool,
+    m: Coefficients, rigid: bool, huang: bool, low: int, high: int,
 ) -> None:
-    """Second half of an evaluation: the fluxes at the loose live points, scattered to the nodes   (20), (21)
+    """Second half of an evaluation: fluxes at loose[low] ... loose[high - 1], scattered to the nodes   (20), (21)
 
     rate (n, F) gets partial sums, before the 1/m_a. The rows of `point` are turned from fields into sources and fluxes:
     rho:   source 0,               flux -D grad W + rho v_adv
@@ -352,7 +352,7 @@ def divergence(
     dim = x.shape[1]
     advection = np.zeros(3)
     slope = np.zeros(3)
-    for l in range(loose.size):
+    for l in range(low, high):
         p = loose[l]
         row = l * (1 + dim)
         begin = offsets[p]
@@ -421,8 +421,8 @@ def sense(
     """Mark the loose points where something happens and name the particles that their slots mean (section 2.4).
 
     flags[p] = 1 where |grad rho| >= eps_rho or any |grad eta| >= eps_eta, else 0. owner[p, s] is the particle found in
-    slot s of the point's nearest nodes, if its eta or |grad eta| is at least `least` here, else -1; where there are two,
-    clash[p] = (one, other), else -1. Points that see no changed node are left as they are.
+    slot s of the point's nearest nodes, if its eta or |grad eta| is at least `least` here, else -1; where there are
+    two, clash[p] = (one, other), else -1. Points that see no changed node are left as they are.
     """
     point = np.empty((1 + dim, u.shape[1]))
     for p in loose:
@@ -535,15 +535,16 @@ def watch_nodes(
     """watch[a]: bit 0 where a switched-off point needs node a, bit 1 + s where a live point near it lacks slot s.
 
     These nodal values decide whether the set of live points and slots still holds. A node counts as near where its
-    N_a(x_p) is at least 2 %: farther ones say little of the slot's value at the point.
+    N_a(x_p) is at least half the largest of the point: farther ones say little of the slot's value there.
     """
     for p in range(flags.size):
         if not flags[p]:
             for e in range(offsets[p], offsets[p + 1]):
                 watch[nodes[e]] |= 1
             continue
+        largest = table[0, rows[p] + places[starts[kind[p]]]]
         for e in range(starts[kind[p]], starts[kind[p] + 1]):
-            if table[0, rows[p] + places[e]] < 0.02:
+            if table[0, rows[p] + places[e]] < 0.5 * largest:
                 break
             a = nodes[offsets[p] + places[e]]
             for s in range(owner.shape[1]):

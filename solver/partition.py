@@ -118,38 +118,54 @@ class Halo:
 
     def add(self, array: Array) -> None:
         """Replace each shared node's partial sum by the sum over its holders, in place; (n,) or (n, F)."""
+        self.finish(array, self.start(array))
+
+    def start(self, array: Array) -> "Exchange | None":
+        """Send the partial sums at the shared nodes; until `finish` they must stay as they are."""
         if not self.neighbours:
+            return None
+        with self.ranks.watch("halo"):
+            return Exchange(self, array)
+
+    def finish(self, array: Array, exchange: "Exchange | None") -> None:
+        """Add what the other holders have sent, in the order of the ranks."""
+        if exchange is None:
             return
         with self.ranks.watch("halo"):
-            self._add(array)
-
-    def _add(self, array: Array) -> None:
-        mine = array[self.shared]
-        received = self._exchange(array)
-        array[self.shared] = 0
-        waiting = True
-        for (rank, common), theirs in zip(self.neighbours, received, strict=True):
-            if waiting and rank > self.ranks.rank:
+            mine = array[self.shared]
+            received = exchange.wait()
+            array[self.shared] = 0
+            waiting = True
+            for (rank, common), theirs in zip(self.neighbours, received, strict=True):
+                if waiting and rank > self.ranks.rank:
+                    array[self.shared] += mine
+                    waiting = False
+                array[common] += theirs
+            if waiting:
                 array[self.shared] += mine
-                waiting = False
-            array[common] += theirs
-        if waiting:
-            array[self.shared] += mine
 
     def most(self, array: Array) -> None:
         """Replace each shared node's value by the largest of its holders, in place."""
-        for (_, common), theirs in zip(self.neighbours, self._exchange(array), strict=True):
+        for (_, common), theirs in zip(self.neighbours, Exchange(self, array).wait(), strict=True):
             array[common] = np.maximum(array[common], theirs)
 
-    def _exchange(self, array: Array) -> list[Array]:
+
+class Exchange:
+    """Values on their way between a rank and its neighbours."""
+
+    def __init__(self, halo: Halo, array: Array) -> None:
+        """Sends the array's values at the nodes shared with each neighbour, and awaits its."""
+        comm = halo.ranks.comm
+        self.sent = [array[common] for _, common in halo.neighbours]
+        self.received = [np.empty_like(values) for values in self.sent]
+        pairs = list(zip(halo.neighbours, self.received, self.sent, strict=True))
+        self.requests = [comm.Irecv(theirs, rank) for (rank, _), theirs, _ in pairs]
+        self.requests += [comm.Isend(mine, rank) for (rank, _), _, mine in pairs]
+
+    def wait(self) -> list[Array]:
         """Every neighbour's values at the nodes shared with it."""
-        comm = self.ranks.comm
-        sent = [array[common] for _, common in self.neighbours]
-        received = [np.empty_like(values) for values in sent]
-        requests = [comm.Irecv(values, rank) for (rank, _), values in zip(self.neighbours, received, strict=True)]
-        requests += [comm.Isend(values, rank) for (rank, _), values in zip(self.neighbours, sent, strict=True)]
-        MPI.Request.Waitall(requests)
-        return received
+        MPI.Request.Waitall(self.requests)
+        return self.received
 
 
 @dataclass(frozen=True)

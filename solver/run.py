@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +17,16 @@ from .state import State
 LOWEST, HIGHEST = -0.5, 1.5  # fields outside these are not physics any more
 SAME_TIME = 1e-9  # of the end: output times nearer than this are one
 LAG = 200.0  # eps that a watched value may move before the set of live points is made anew
+UNEVEN = 0.1  # growth of the imbalance, as a part of the mean work, after which the mesh is divided anew
 REFRESH = 50  # steps after which points that have come to rest are switched off
+
+
+class Ending(Enum):
+    """Why `run` came back."""
+
+    DONE = "the end of the case"
+    STOPPED = "the observer"
+    UNBALANCED = "some ranks have come to have more work than others"
 
 
 class RunError(RuntimeError):
@@ -63,16 +73,18 @@ def events(case: Case) -> list[Event]:
     return merged
 
 
-def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer) -> bool:
-    """March from the state's time to the end of the case. False where the observer ended it before.
+def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer) -> Ending:
+    """March from the state's time to the end of the case, or until the observer ends it.
 
-    A fresh state first gives the events of time 0; a resumed one goes on behind its time.
+    A fresh state first gives the events of time 0; a resumed one goes on behind its time. Where the work has moved
+    from rank to rank (`UNEVEN`), the run ends as well, to be divided anew and resumed.
     """
     case = scheme.d.case
     waiting = [event for event in events(case) if event.time > state.time or state.step == 0]
     integrator.restart(scheme, state)
     watch = scheme.d.share.ranks.watch
     watch.enter("steps")
+    even = scheme.imbalance()
     while waiting:
         limit = waiting[0].time if integrator.stops_at_events else waiting[-1].time
         if state.time < waiting[0].time:
@@ -85,13 +97,15 @@ def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer
                     observer.history(scheme, state, u, event.time)
                 if event.snapshot is not None:
                     observer.snapshot(event.snapshot, scheme, state, u, event.time)
-        if renew(scheme, state):
+        if renewed := renew(scheme, state):
             integrator.restart(scheme, state)
         with watch("output"):
             ended = observer.after_step(scheme, state, integrator)
         if ended and waiting:
-            return False
-    return True
+            return Ending.STOPPED
+        if renewed and waiting and scheme.imbalance() > even + UNEVEN:
+            return Ending.UNBALANCED
+    return Ending.DONE
 
 
 def reached(waiting: list[Event], time: float) -> Iterator[Event]:

@@ -5,6 +5,7 @@ Nodes carry rho and eta, material points only integrate (Huang et al. 2023, sect
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,6 +32,8 @@ class Scheme:
     def activate(self, state: State) -> None:
         """Choose the live points and slots for this state (it may move slots), and fit the work arrays. Collective."""
         with self.d.share.ranks.watch("live points"):
+            # What is chosen from; a resumed run chooses from it again, and comes to the same.
+            self.before = replace(state, u=state.u.copy(), owner=state.owner.copy(), slot_of=state.slot_of.copy())
             self._activate(state)
 
     def _activate(self, state: State) -> None:
@@ -77,7 +80,6 @@ class Scheme:
         # Fields and gradients at the points (17), mobility (5), and the potential (24)
         #   W_a = 1/m_a sum_p w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]
         self._gather(u)
-        d.share.halo.add(self.W)
         kernels.divide_values(self.W, d.mass, a.nodes)
 
         # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
@@ -96,11 +98,13 @@ class Scheme:
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
         watch.enter("scatter")
         self._scatter(rate)
-        if moving:
-            kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
-        d.share.halo.add(rate)
         kernels.scale(rate, self.inverse_mass, a.nodes)
         watch.enter(before)
+
+    def imbalance(self) -> float:
+        """By how much the busiest rank's work exceeds the mean, as a part of it; 0 on one rank. Collective."""
+        work, ranks = np.array([self.active.work()]), self.d.share.ranks
+        return float(ranks.max(work.copy())[0] * ranks.size / ranks.sum(work)[0] - 1.0)
 
     def _stiffness(self) -> Floats:
         """How the contact forces answer to rigid motion, (pairs, 2, k, k) summed over the ranks, after `_meet`."""
@@ -115,36 +119,60 @@ class Scheme:
         return d.share.ranks.sum(stiffness)
 
     def _gather(self, u: Floats) -> None:
-        """Fields and D of this rank's points, and its part of W, in the work arrays."""
-        d, a, table = self.d, self.active, self.d.shape
+        """Fields and D of this rank's points in the work arrays, and W summed over the ranks."""
+        d, a = self.d, self.active
         kernels.start(self.W, a.potential, a.nodes)
-        touches = kernels.potential(
+        block_kernels.to_columns(self.u_columns, u, a.nodes)
+        self.touches = 0
+        self._potential(u, (0, a.loose_border), (0, a.blocks.border))
+        under_way = d.share.halo.start(self.W)  # what goes to shared nodes is complete; the rest is done meanwhile
+        self._potential(u, (a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
+        d.share.halo.finish(self.W, under_way)
+
+    def _potential(self, u: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
+        """The part of `_gather` for some of the loose points and blocks."""
+        d, a, table = self.d, self.active, self.d.shape
+        self.touches = kernels.potential(
             self.W, self.touching, self.point, self.D, self.S2, u, a.loose, a.mask, a.present, a.several,
             d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
+            *loose, self.touches,
         )
-        block_kernels.to_columns(self.u_columns, u, a.nodes)
         self.touches = block_kernels.potential(
-            self.W_row, self.touching, touches, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
+            self.W_row, self.touching, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
             a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.mask, a.blocks.partial,
             d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table, d.coefficients,
+            *blocks, self.touches,
         )
 
     def _scatter(self, rate: Floats) -> None:
-        """Sources and fluxes of this rank's points, summed into rate, after `_gather` and once the motion is known."""
-        d, a, table = self.d, self.active, self.d.shape
-        moving, motion = d.case.model.rigid_motion, rigid.in_space(self.motion)
+        """Sources and fluxes of all points in rate, times m_a, after `_gather` and once the motion is known."""
+        d, a = self.d, self.active
+        kernels.clear(rate, a.nodes)
         self.rate_columns[:] = 0.0
+        if d.case.model.rigid_motion:
+            kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
+        motion = rigid.in_space(self.motion)
+        self._divergence(rate, motion, (0, a.loose_border), (0, a.blocks.border))
+        block_kernels.add_columns(rate, self.rate_columns, a.shared)
+        under_way = d.share.halo.start(rate)
+        self._divergence(rate, motion, (a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
+        block_kernels.add_columns(rate, self.rate_columns, a.inner)
+        d.share.halo.finish(rate, under_way)
+
+    def _divergence(self, rate: Floats, motion: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
+        """The part of `_scatter` for some of the loose points and blocks; those of the blocks go to `rate_columns`."""
+        d, a, table = self.d, self.active, self.d.shape
+        moving = d.case.model.rigid_motion
+        kernels.divergence(
+            rate, self.point, self.D, self.S2, self.W, motion, self.velocity,
+            a.loose, a.owner, a.present, d.weights, d.x,
+            table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang, *loose,
+        )
         block_kernels.divergence(
             self.rate_columns, self.fields, self.D_blocks, self.S2_blocks, self.W_row, motion,
             a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.particle, a.blocks.owner,
             d.blocks.x, d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table,
-            d.coefficients, moving, d.huang,
-        )
-        block_kernels.from_columns(rate, self.rate_columns, a.nodes)
-        kernels.divergence(
-            rate, self.point, self.D, self.S2, self.W, motion, self.velocity,
-            a.loose, a.owner, a.present, d.weights, d.x,
-            table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang,
+            d.coefficients, moving, d.huang, *blocks,
         )
 
     def _meet(self) -> None:

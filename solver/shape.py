@@ -56,7 +56,7 @@ class ShapeTable:
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nodes that count most: point p's are nodes[offsets[p] + places[e]], starts[kind[p]] <= e < starts[kind[p] + 1].
+    """The nodes that count most: nodes[offsets[p] + places[e]] at point p, starts[kind[p]] <= e < starts[kind[p] + 1].
 
     They are in the order of falling N. kind (p,), starts (kinds + 1,), places: points that share rows share these.
     """

@@ -150,17 +150,19 @@ def kill_one(kind: str, running: Service, random_: random.Random) -> bool:
     return False
 
 
-def disturb(running: Service, kills: int, pause: float, seed: int) -> Counter[str]:
-    """Kill until `kills` have been killed or all jobs are done; a killed service is started again after a while."""
+def disturb(running: Service, kills: int, seconds: float, seed: int) -> Counter[str]:
+    """Kill `kills` times within about `seconds`, or until all jobs are done; a killed service is started again."""
     random_, counts = random.Random(seed), Counter[str]()
-    while sum(counts.values()) < kills and not all_done(running.data):
-        time.sleep(random_.uniform(0.0, 2.0 * pause))
-        kind = random_.choice(VICTIMS)
-        if kill_one(kind, running, random_):
-            counts[kind] += 1
-            if kind == "service":
-                time.sleep(random_.uniform(0.0, pause))
-                running.start()
+    began = time.monotonic()
+    for moment in sorted(random_.uniform(0.0, seconds) for _ in range(kills)):
+        time.sleep(max(0.0, began + moment - time.monotonic()))
+        while not kill_one(kind := random_.choice(VICTIMS), running, random_):
+            if all_done(running.data):
+                return counts
+        counts[kind] += 1
+        if kind == "service":
+            time.sleep(random_.uniform(0.0, seconds / kills))
+            running.start()
     return counts
 
 
@@ -213,11 +215,10 @@ def histories(data: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def run_undisturbed(data: Path, jobs: list[NewJob], seconds: float) -> None:
-    """The same jobs, left alone."""
+def run_undisturbed(data: Path, jobs: list[NewJob], seconds: float) -> float:
+    """The same jobs, left alone: how long they take."""
     submit(data, jobs)
     with service(data):
+        began = time.monotonic()
         wait(data, seconds)
-
-
-
+        return time.monotonic() - began

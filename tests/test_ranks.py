@@ -28,12 +28,12 @@ from frit.solver.scheme import Scheme
 
 rates, calls = Scheme.rates, 0
 
-def broken(self, u, rate):
+def broken(self, u, rate, tau=None):
     global calls
     calls += 1
     if calls == 40 and self.d.share.ranks.rank == {rank}:  # step 20: two evaluations each
         raise ValueError("the sum came out wrong")
-    rates(self, u, rate)
+    rates(self, u, rate, tau)
 
 Scheme.rates = broken
 sys.exit(solver.main())
@@ -74,6 +74,43 @@ def test_two_ranks_take_the_adaptive_steps_of_one(tmp_path: Path) -> None:
     }
     alone, together = solve(case, tmp_path / "1"), solve(case, tmp_path / "2", ranks=2)
     assert different(alone, together, 1e-8) == {}
+
+
+# Live points are chosen every 20 steps; RESTLESS: and then the mesh is divided anew, each time by other work.
+OFTEN = """
+import sys
+from frit.solver import prepare, run
+from frit.solver import __main__ as solver
+
+run.REFRESH = 20
+"""
+RESTLESS = """
+run.UNEVEN, activity, times = -1.0, prepare.activity, 0
+
+def uneven(mesh, u, eps):
+    global times
+    times += 1
+    work = activity(mesh, u, eps)
+    work[mesh.points[:, times % 2] > 8.0] *= 1.0 + times
+    return work
+
+prepare.activity = uneven
+status = solver.main()
+assert times > 3, times
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize("integrator", ["rk2", "adaptive"])
+def test_a_run_divided_anew_is_the_same_run(tmp_path: Path, integrator: str) -> None:
+    """It goes on in the same process from a checkpoint of this moment."""
+    case = TRIPLE[2]
+    if integrator == "adaptive":
+        case = case | {"time": {"integrator": "adaptive", "end": 0.5}, "output": {"history_every": 0.05}}
+    alone = solve(case, tmp_path / "1", ranks=2, script=OFTEN + "sys.exit(solver.main())")
+    divided = solve(case, tmp_path / "2", ranks=2, script=OFTEN + RESTLESS)
+    assert different(alone, divided, 1e-10 if integrator == "rk2" else 1e-8) == {}
+    assert record(divided)["resumed"] == []
 
 
 @pytest.mark.parametrize("rank", [0, 1])

@@ -158,12 +158,40 @@ def test_a_checkpoint_with_slots_to_spare_goes_on(tmp_path: Path, whole: dict[st
             u[:, [0, 1, 9]] = file[name][:, :3]
             del file[name]
             file[name] = u
-        owner = np.full((len(u), 9), -1, dtype=np.int32)
-        owner[:, [0, 8]] = file["owner"][...]
-        del file["owner"]
-        file["owner"] = owner
-        file["slot_of"][...] = [0, 8]
+        for name in ("owner", "reference_owner"):
+            owner = np.full((len(u), 9), -1, dtype=np.int32)
+            owner[:, [0, 8]] = file[name][...]
+            del file[name]
+            file[name] = owner
+        file["slot_of"][...] = file["reference_slot_of"][...] = [0, 8]
     assert different(whole["rk2"], resume(directory), SAME) == {}
+
+
+# A frit of before: nodes along the space-filling curve, and a checkpoint that says so.
+OLDER = """
+import sys
+from frit.solver import __main__ as solver, checkpoint
+
+build_mesh, checkpoint.FORMAT = solver.build_mesh, 2
+solver.build_mesh = lambda case, ranks, rows: build_mesh(case, ranks, False)
+"""
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_checkpoint_of_an_older_frit_goes_on(tmp_path: Path, number: int) -> None:
+    """With its own numbers of the nodes: rows, fields and snapshots are those of an older frit that nobody stopped."""
+    whole = solve(PAIR, tmp_path / "whole", script=OLDER + "sys.exit(solver.main())")
+    directory = tmp_path / "run"
+    with launch(PAIR, directory, script=OLDER + held_at(17)) as tree:
+        until_held(tree, directory, 1, 17)
+        tree.process.send_signal(signal.SIGTERM)
+        tree.ended()
+    with h5py.File(directory / "checkpoint.h5", "r+") as file:
+        assert file.attrs["format"] == 2
+        file.attrs["format"] = number
+        if number == 1:
+            del file["motion"]
+    assert different(whole, resume(directory), SAME) == {}
 
 
 def test_a_finished_run_stays_as_it_is(tmp_path: Path, whole: dict[str, Path]) -> None:
@@ -176,32 +204,34 @@ def test_a_finished_run_stays_as_it_is(tmp_path: Path, whole: dict[str, Path]) -
     assert not any(path.exists() for path in torn)
 
 
-def starts(directory: Path) -> object:
-    """Differs once the solver has begun to run there, again or for the first time."""
-    return record(directory).get("start"), record(directory).get("resumed")
+def rows_so_far(directory: Path) -> int:
+    """Complete rows of the history."""
+    path = directory / "history.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
 @pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_kill_9_at_any_moment_leaves_no_trace(tmp_path: Path, kills: int) -> None:
     """Every kill is at a moment of its own: while Python starts, in a step, or while rows, chunks, a checkpoint or
-    run.json are being written."""
+    run.json are being written. All but those at the start wait until the run has got on by some of its 200 rows."""
     case = PAIR | {
         "time": {"integrator": "rk2", "end": 0.2, "step": 1e-4},
         "output": {"history_every": 0.001, "snapshots": {"every": 0.005}, "checkpoint_every": 0.05},
     }
-    solve(case | {"time": case["time"] | {"end": 0.001}}, tmp_path / "compiled")  # what is compiled now is not timed
-    began = time.monotonic()
     undisturbed = solve(case, tmp_path / "whole")
-    share = 1.5 * (time.monotonic() - began) / kills
+    row = history(undisturbed)[-1]["wall_time"] / 200
     directory, random = tmp_path / "run", np.random.default_rng(kills)
     path = write_case(directory, case)
-    for _ in range(kills):
-        before, early = starts(directory), random.random() < 0.25
+    for number in range(kills):
         goes_on = (directory / "checkpoint.h5").exists()
         with Tree(1, "--resume", directory) if goes_on else Tree(1, path, "--out", directory) as tree:
-            while not early and tree.process.poll() is None and starts(directory) == before:
-                time.sleep(0.005)
-            time.sleep(random.uniform(0.0, share))
+            if number % 4 == 3:
+                time.sleep(random.uniform(0.0, 1.0))
+            else:
+                aim = rows_so_far(directory) + random.integers(1, 200 // kills)
+                while tree.process.poll() is None and rows_so_far(directory) < aim:
+                    time.sleep(0.2 * row)
+                time.sleep(random.uniform(0.0, 2.0 * row))
             tree.kill()
     assert record(directory)["resumed"], "no kill hit the run itself"
     resume(directory)

@@ -15,7 +15,7 @@ from frit.solver.geometry import Mesh
 from frit.solver.integrators import Integrator
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
-from frit.solver.run import Event, RunError, check, events, run
+from frit.solver.run import Ending, Event, RunError, check, events, run
 from frit.solver.scheme import Scheme
 from frit.solver.state import State
 
@@ -124,7 +124,7 @@ def test_the_observer_hears_of_every_event_in_order(ranks: Ranks, integrator: di
     case = discs(output=OUTPUT, end=0.1, **integrator)
     mesh, scheme, state = start(case, ranks)
     log = Log()
-    assert run(scheme, state, make_integrator(case, mesh), log)
+    assert run(scheme, state, make_integrator(case, mesh), log) is Ending.DONE
     np.testing.assert_allclose(log.rows, [0.0, 0.03, 0.06, 0.09, 0.1], rtol=1e-12)
     np.testing.assert_allclose([time for _, time in log.numbers], [0.0, 0.05, 0.1], rtol=1e-12)
     assert [number for number, _ in log.numbers] == [0, 1, 2]
@@ -142,7 +142,7 @@ def test_fields_between_adaptive_steps_are_those_of_the_time(ranks: Ranks) -> No
         case = discs(output=OUTPUT, end=0.1, **integrator)
         mesh, scheme, state = start(case, ranks)
         logs.append(Log())
-        assert run(scheme, state, make_integrator(case, mesh), logs[-1])
+        assert run(scheme, state, make_integrator(case, mesh), logs[-1]) is Ending.DONE
         assert scheme.active.owner.shape[1] == 2
     for ours, theirs in zip(logs[0].rows, logs[1].rows, strict=True):
         np.testing.assert_allclose(logs[0].fields[ours], logs[1].fields[theirs], rtol=0, atol=3e-3)
@@ -155,9 +155,9 @@ def test_a_run_that_is_ended_goes_on_where_it_was(ranks: Ranks, integrator: dict
     mesh, scheme, state = start(case, ranks)
     first, second = Log(stop=4), Log()
     method = make_integrator(case, mesh)
-    assert not run(scheme, state, method, first)
+    assert run(scheme, state, method, first) is Ending.STOPPED
     assert 0.0 < state.time < 0.1
-    assert run(scheme, state, method, second)
+    assert run(scheme, state, method, second) is Ending.DONE
     np.testing.assert_allclose(first.rows + second.rows, [0.0, 0.03, 0.06, 0.09, 0.1], rtol=1e-12)
     assert [number for number, _ in first.numbers + second.numbers] == [0, 1, 2]
 
@@ -165,7 +165,7 @@ def test_a_run_that_is_ended_goes_on_where_it_was(ranks: Ranks, integrator: dict
 def test_who_asks_for_the_end_at_the_end_gets_a_finished_run(ranks: Ranks) -> None:
     case = discs(end=0.002, integrator="rk2", step=0.001)
     mesh, scheme, state = start(case, ranks)
-    assert run(scheme, state, make_integrator(case, mesh), Log(stop=101))
+    assert run(scheme, state, make_integrator(case, mesh), Log(stop=101)) is Ending.DONE
     assert state.time == 0.002
 
 

@@ -1,0 +1,198 @@
+"""Points in lattice rows go eight at a time: the same numbers as one by one, whoever exists in whichever lane."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from frit.solver import blocks
+from frit.solver.arrays import Floats
+from frit.solver.blocks import MIXED, Blocks, find_blocks
+from frit.solver.case import Case, parse_case
+from frit.solver.discretisation import activity
+from frit.solver.geometry import Mesh, lattice
+from frit.solver.partition import Ranks
+from frit.solver.prepare import build_mesh, prepare
+from frit.solver.scheme import Scheme
+from frit.solver.shape import lme
+from frit.solver.state import State
+
+SIZES = [(23.0, 11.0), (18.0, 6.0, 5.0)]
+
+
+def nothing_shared(mesh: Mesh) -> Any:
+    return np.zeros(len(mesh.nodes), dtype=bool)
+
+
+@pytest.mark.parametrize("size", SIZES, ids=["2-D", "3-D"])
+def test_every_point_is_in_one_lane_or_loose(size: tuple[float, ...]) -> None:
+    mesh = lattice(size, 0.8)
+    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
+    found = find_blocks(table, mesh.points, nothing_shared(mesh))
+    numbers = np.concatenate([found.points[found.points >= 0], found.loose])
+    np.testing.assert_array_equal(np.sort(numbers), np.arange(len(mesh.points)))
+    assert ((found.points >= 0).sum(axis=1) >= 2).all()
+    assert found.loose.size < 0.4 * len(mesh.points)  # the first and last points of a row have functions of their own
+
+
+@pytest.mark.parametrize("size", SIZES, ids=["2-D", "3-D"])
+def test_the_next_lane_sees_the_next_nodes(size: tuple[float, ...]) -> None:
+    mesh = lattice(size, 0.8)
+    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
+    found = find_blocks(table, mesh.points, nothing_shared(mesh))
+    for b, points in enumerate(found.points):
+        first = table.nodes[found.begin[b] : found.begin[b] + found.count[b]]
+        for j, p in enumerate(points):
+            if p >= 0:
+                np.testing.assert_array_equal(table.nodes[table.offsets[p] : table.offsets[p + 1]], first + j)
+                assert table.rows[p] == found.start[b]
+                np.testing.assert_array_equal(found.x[3 * b : 3 * b + mesh.points.shape[1], j], mesh.points[p])
+            else:
+                assert (points[j:] < 0).all()
+
+
+def test_points_of_scattered_nodes_are_loose() -> None:
+    mesh = lattice((9.0, 7.0), 0.8)
+    nodes = mesh.nodes + np.random.default_rng(0).uniform(-0.05, 0.05, mesh.nodes.shape)
+    table = lme(mesh.points, mesh.spacing, nodes, 1.8, 1e-6)
+    found = find_blocks(table, mesh.points, nothing_shared(mesh))
+    assert len(found.points) == 0
+    np.testing.assert_array_equal(found.loose, np.arange(len(mesh.points)))
+
+
+def test_who_sees_a_shared_node_is_at_the_border() -> None:
+    mesh = lattice((23.0, 11.0), 0.8)
+    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
+    shared = mesh.nodes[:, 1] > 9.0
+    found = find_blocks(table, mesh.points, shared)
+    at_border = np.zeros(len(mesh.points), dtype=bool)
+    for p in range(len(mesh.points)):
+        at_border[p] = shared[table.nodes[table.offsets[p] : table.offsets[p + 1]]].any()
+    assert 0 < found.border.sum() < len(found.border)
+    for lanes, border in zip(found.points, found.border, strict=True):
+        assert at_border[lanes[lanes >= 0]].any() == border
+    np.testing.assert_array_equal(at_border[found.loose], np.arange(found.loose.size) < found.loose_border)
+
+
+# --- rates, and the choice of live points
+
+
+def grains(dim: int, activation: dict[str, Any], model: dict[str, Any]) -> Case:
+    """Two touching pairs, and room in which nothing happens."""
+    if dim == 2:
+        centres = [[4.0, 4.0], [4.2, 8.9], [16.0, 4.0], [16.1, 8.9]]
+        tree: dict[str, Any] = {"domain": {"size": [40.0, 14.0]}, "nodes": {"spacing": 0.6}}
+    else:
+        centres = [[4.0, 4.0, 3.6], [4.2, 8.7, 3.5], [17.0, 4.0, 3.5], [17.1, 8.7, 3.4]]
+        tree = {"domain": {"size": [36.0, 13.0, 7.0]}, "nodes": {"spacing": 0.8}}
+    return parse_case(
+        tree
+        | {
+            "particles": {"centres": centres, "radii": [2.5, 2.4] * 2, "interface_width": 0.5},
+            "time": {"end": 1.0},
+            "activation": activation,
+            "model": model | {"m_r": 40.0},
+        }
+    )
+
+
+def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on every point is loose."""
+
+    def none(table: Any, x: Floats, shared: Any) -> Blocks:
+        found = find_blocks(table, x, shared)
+        edge = np.zeros(table.points, dtype=bool)
+        blocks.see(edge, shared, table.offsets, table.nodes)
+        every = np.concatenate([np.flatnonzero(edge), np.flatnonzero(~edge)])
+        empty = {name: getattr(found, name)[:0] for name in ("points", "begin", "count", "start", "x", "border")}
+        return replace(found, **empty, loose=every, loose_border=int(edge.sum()))
+
+    monkeypatch.setattr("frit.solver.discretisation.find_blocks", none)
+
+
+def rates_of(scheme: Scheme, state: State) -> Floats:
+    rate = np.zeros_like(state.u)
+    scheme.rates(state.u, rate)
+    return rate
+
+
+@pytest.mark.parametrize("advection", ["huang", "wang", None])
+@pytest.mark.parametrize("enabled", [True, False], ids=["some points live", "all live"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_rates_are_those_of_single_points(
+    ranks: Ranks, monkeypatch: pytest.MonkeyPatch, dim: int, enabled: bool, advection: str | None
+) -> None:
+    """The same sums in another order; which points live, and which particles exist where, is the same."""
+    model = {"rigid_motion": False} if advection is None else {"advection": advection}
+    case = grains(dim, {"enabled": enabled, "eps_rho": 1e-4, "eps_eta": 1e-4}, model)
+    mesh = build_mesh(case, ranks)
+    monkeypatch.setattr("frit.solver.active.WORTH", 1.0)
+    scheme, state = prepare(case, mesh, ranks)
+    one_by_one(monkeypatch)
+    single, same = prepare(case, mesh, ranks)
+    together, alone = scheme.active, single.active
+    assert len(together.blocks.blocks) > 0
+    assert len(alone.blocks.blocks) == 0
+    assert enabled == (together.live.size < len(mesh.points))
+    assert together.blocks.partial.any()
+    np.testing.assert_array_equal(together.live, alone.live)
+    np.testing.assert_array_equal(state.owner, same.owner)
+    np.testing.assert_array_equal(state.u, same.u)
+    np.testing.assert_array_equal(together.watch, alone.watch)
+    exact = rates_of(single, same)
+    rate = rates_of(scheme, state)
+    mixed = np.where(together.blocks.particle >= 0, MIXED, -1)  # as if lanes had different particles: each looks for its
+    scheme.active = replace(together, blocks=replace(together.blocks, particle=mixed.astype(np.int32)))
+    np.testing.assert_allclose(rates_of(scheme, state), rate, rtol=0, atol=1e-13 * np.abs(rate).max())
+    for column in range(rate.shape[1]):
+        scale = max(np.abs(exact[:, column]).max(), 1e-30)
+        np.testing.assert_allclose(rate[:, column], exact[:, column], rtol=0, atol=1e-12 * scale)
+    scale = np.abs(single.forces).max(initial=1e-30)
+    np.testing.assert_allclose(scheme.forces, single.forces, rtol=0, atol=1e-12 * scale)
+
+
+def test_more_contacts_than_there_was_room_for(ranks: Ranks) -> None:
+    """Nothing of them is lost: forces are the same when there is ample room from the start."""
+    case = grains(2, {}, {})
+    mesh = build_mesh(case, ranks)
+    found = []
+    for room in (2, 100_000):
+        scheme, state = prepare(case, mesh, ranks)
+        state.u[:, 1:3] = np.maximum(state.u[:, 1:3], 0.45)  # meet everywhere
+        scheme._make_room(room)
+        rates_of(scheme, state)
+        assert scheme.meetings > 2
+        found.append(scheme.forces.copy())
+    np.testing.assert_array_equal(*found)
+
+
+# --- what a rank has to do
+
+
+def test_expected_work_counts_the_fields_that_exist(ranks: Ranks) -> None:
+    """A point of vapour has rho alone, one inside a particle its order parameter, one in a contact two of them."""
+    case = parse_case(
+        {
+            "domain": {"size": [60.0, 30.0]},
+            "nodes": {"spacing": 1.0},
+            "particles": {"centres": [[20.0, 15.0], [36.0, 15.0]], "radii": [8.0, 8.0]},
+            "time": {"end": 1.0},
+        }
+    )
+    mesh = build_mesh(case, ranks)
+    _, state = prepare(case, mesh, ranks)
+    work = activity(mesh, state.u, 1e-5)
+
+    def at(x: float, y: float) -> float:
+        return float(work[np.argmin(np.linalg.norm(mesh.points - (x, y), axis=1))])
+
+    assert at(28.0, 15.0) == at(20.0, 7.0) + 1.0
+    assert at(58.0, 28.0) < 0.2  # rests
+
+
+def test_work_is_shared_evenly(ranks: Ranks) -> None:
+    """On one rank there is nothing to share, and nothing out of balance."""
+    scheme, _ = prepare(grains(2, {}, {}), build_mesh(grains(2, {}, {}), ranks), ranks)
+    assert scheme.imbalance() == 0.0
+    assert scheme.active.work() > scheme.active.blocks.blocks.size

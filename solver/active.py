@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import block_kernels, kernels, slots
-from .arrays import Flags, Floats, Integers, Numbers
+from .arrays import Array, Flags, Floats, Integers, Numbers
 from .blocks import LiveBlocks, live_blocks
 from .discretisation import FIXED_WORK, WORTH, Discretisation
 from .rigid import rotations
@@ -143,7 +143,7 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
         if not d.case.activation.few_order_parameters:
             owner[:] = np.arange(owner.shape[1], dtype=np.int32)
             return flags, owner
-        claims, clashes = _claim(d, state, owner, clash)
+        claims, clashes = _claim(d, owner, clash)
         clashes = _everyones_pairs(d, clashes)
         if len(clashes) or state.u.shape[1] > LANES:
             every = np.arange(d.nodes)
@@ -171,16 +171,22 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
 
 
-def _claim(d: Discretisation, state: State, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:
+def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:
     """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot."""
-    claims = np.full_like(state.owner, -1)
-    crowded = np.empty_like(clash)
-    near = d.nearest
-    kernels.claim(claims, crowded, owner, d.shape.offsets, d.shape.nodes, near.kind, near.starts, near.places)
-    mine = claims.copy()
-    d.share.halo.most(claims)
-    torn = (mine >= 0) & (mine != claims)
-    return claims, np.concatenate([clash, crowded, np.stack([mine[torn], claims[torn]], axis=1)])
+    near, blocks, table = d.nearest, d.blocks, d.shape
+    high = np.full((owner.shape[1], d.nodes + LANES), -1.0)
+    low = np.full_like(high, block_kernels.NOBODY)
+    block_kernels.claim(
+        high, low, owner, blocks.points, blocks.begin, table.nodes, near.kind, near.starts, near.places
+    )
+    kernels.claim(
+        high, low, owner, blocks.loose, table.offsets, table.nodes, near.kind, near.starts, near.places
+    )
+    claims = np.ascontiguousarray(high[:, : d.nodes].T.astype(np.int32))
+    lowest = np.ascontiguousarray(low[:, : d.nodes].T.astype(np.int32))
+    _spread(d, lowest, claims)
+    crowded = (claims >= 0) & (lowest < claims)
+    return claims, np.concatenate([clash, np.stack([lowest[crowded], claims[crowded]], axis=1)])
 
 
 def _sense(d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers, changed: Flags) -> None:
@@ -193,9 +199,12 @@ def _sense(d: Discretisation, state: State, flags: Numbers, owner: Numbers, clas
     )
     columns = np.zeros((state.u.shape[1], d.nodes + LANES))
     block_kernels.to_columns(columns, state.u, np.arange(d.nodes))
+    high = np.full((state.owner.shape[1], d.nodes + LANES), -1.0)
+    high[:, : d.nodes] = state.owner.T
+    low = np.where(high < 0.0, block_kernels.NOBODY, high)
     block_kernels.sense(
-        flags, owner, clash, columns, state.owner, switch.eps_rho, switch.eps_eta, least, blocks.points, changed,
-        blocks.begin, blocks.count, blocks.start, table.offsets, table.nodes, table.table,
+        flags, owner, clash, columns, state.owner, high, low, switch.eps_rho, switch.eps_eta, least, blocks.points,
+        changed, blocks.begin, blocks.count, blocks.start, table.nodes, table.table,
         near.kind, near.starts, near.places,
     )
 
@@ -205,7 +214,7 @@ def _everyones_pairs(d: Discretisation, pairs: Integers) -> Integers:
     return slots.unique_pairs(np.concatenate(d.share.ranks.everyones(slots.unique_pairs(pairs))))
 
 
-def _spread(d: Discretisation, low: Integers, high: Integers) -> None:
+def _spread(d: Discretisation, low: Array, high: Array) -> None:
     """Smallest `low` and largest `high` over the holders of each shared node."""
     d.share.halo.most(high)
     np.negative(low, out=low)

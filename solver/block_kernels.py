@@ -11,8 +11,10 @@ import numpy as np
 from .arrays import Flags, Floats, Integers, Numbers
 from .energy import Coefficients, df_deta, df_drho, mobility
 from .jit import inlined, jit
-from .kernels import find_owner, touching_share, x_velocity, y_velocity, z_velocity
+from .kernels import touching_share, x_velocity, y_velocity, z_velocity
 from .simd import LANES, load, positive, splat, store
+
+NOBODY = 1e9  # more than any number of a particle: those of several are compared as floats, eight at a time
 
 
 @inlined
@@ -247,6 +249,7 @@ def divergence(
 ) -> None:
     """Second half, as `kernels.divergence`: fluxes of live blocks low ... high - 1, scattered to rate (F, n + LANES).
 
+    Fields go two by two, rho last: its flux needs what all order parameters are swept along with.
     """
     width = table.shape[0]
     dim = width - 1
@@ -316,16 +319,21 @@ def divergence(
 
 @jit
 def sense(
-    flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, node_owner: Numbers,
+    flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, node_owner: Numbers, high: Floats, low: Floats,
     eps_rho: float, eps_eta: float, least: float, points: Numbers, changed: Flags,
-    begins: Integers, counts: Integers, block_starts: Integers, offsets: Integers, nodes: Numbers, table: Floats,
+    begins: Integers, counts: Integers, block_starts: Integers, nodes: Numbers, table: Floats,
     kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
-    """`kernels.sense` for the points in blocks. Order parameters are 0 where nobody owns their slot."""
+    """`kernels.sense` for the points in blocks. Order parameters are 0 where nobody owns their slot.
+
+    high, low (slots, n + LANES): node_owner by columns, with -1 and with `NOBODY` where there is no owner.
+    """
     held = np.zeros(node_owner.shape[0], dtype=np.int64)
     slots_of_eight(held, node_owner, changed)
     width = table.shape[0]
     fields = np.empty((width, LANES))
+    found = np.empty((2, LANES))
+    exists = np.empty(LANES, dtype=np.bool_)
     for b in range(points.shape[0]):
         begin = begins[b]
         some = np.int64(0)
@@ -340,22 +348,67 @@ def sense(
                 clash[p, 0] = -1
                 for s in range(node_owner.shape[1]):
                     owner[p, s] = -1
+        pattern = kind[points[b, 0]]
         for column in range(1 + node_owner.shape[1]):
             if column > 0 and not some >> column & 1:
                 continue
             gather(fields, 0, columns, column, begin, counts[b], block_starts[b], nodes, table)
             eps = eps_rho if column == 0 else eps_eta
+            several = False
             for j in range(LANES):
-                p = points[b, j]
-                if p < 0:
-                    continue
                 square = 0.0
                 for k in range(1, width):
                     square += fields[k, j] * fields[k, j]
-                if square >= eps * eps:
-                    flags[p] = 1
-                if column > 0 and (square >= least * least or abs(fields[0, j]) >= least):
-                    find_owner(owner, clash, p, column - 1, node_owner, offsets, nodes, kind, starts, places)
+                exists[j] = column > 0 and (square >= least * least or abs(fields[0, j]) >= least)
+                several |= exists[j]
+                if square >= eps * eps and points[b, j] >= 0:
+                    flags[points[b, j]] = 1
+            if not several:
+                continue
+            largest = splat(-1.0)
+            smallest = splat(NOBODY)
+            for e in range(starts[pattern], starts[pattern + 1]):
+                a = nodes[begin + places[e]]
+                largest = largest + positive(load(high, column - 1, a) - largest)
+                smallest = smallest - positive(smallest - load(low, column - 1, a))
+            store(found, 0, 0, largest)
+            store(found, 1, 0, smallest)
+            for j in range(LANES):
+                p = points[b, j]
+                if p >= 0 and exists[j]:
+                    owner[p, column - 1] = np.int32(found[0, j])
+                    if 0.0 <= found[1, j] < found[0, j]:
+                        clash[p, 0] = np.int64(found[1, j])
+                        clash[p, 1] = np.int64(found[0, j])
+
+
+@jit
+def claim(
+    high: Floats, low: Floats, owner: Numbers, points: Numbers,
+    begins: Integers, nodes: Numbers, kind: Integers, starts: Integers, places: Numbers,
+) -> None:
+    """`kernels.claim` for the points in blocks; high and low (slots, n + LANES)."""
+    mine = np.empty((2, LANES))
+    for b in range(points.shape[0]):
+        pattern = kind[points[b, 0]]
+        for s in range(owner.shape[1]):
+            some = False
+            for j in range(LANES):
+                p = points[b, j]
+                particle = owner[p, s] if p >= 0 else np.int32(-1)
+                mine[0, j] = particle
+                mine[1, j] = particle if particle >= 0 else NOBODY
+                some |= particle >= 0
+            if not some:
+                continue
+            largest = load(mine, 0, 0)
+            smallest = load(mine, 1, 0)
+            for e in range(starts[pattern], starts[pattern + 1]):
+                a = nodes[begins[b] + places[e]]
+                before = load(high, s, a)
+                store(high, s, a, before + positive(largest - before))
+                before = load(low, s, a)
+                store(low, s, a, before - positive(before - smallest))
 
 
 @jit

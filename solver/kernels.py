@@ -472,27 +472,23 @@ def steep(point: Floats, column: int, eps: float) -> bool:
 
 @jit
 def claim(
-    node_owner: Numbers, clash: Integers, owner: Numbers,
+    high: Floats, low: Floats, owner: Numbers, loose: Integers,
     offsets: Integers, nodes: Numbers, kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
-    """Let the particles claim the nodes of every point at which they exist: where they are, and a ring to grow into.
+    """Let the particles claim the nodes of every loose point at which they exist: where they are, and a ring around.
 
-    Only a point's nearest nodes count. Where a node's slot is another particle's already, clash[p] = (one, other).
+    Only a point's nearest nodes count. high[s, a] and low[s, a] become the largest and the smallest of the particles
+    that claim slot s of node a.
     """
-    for p in range(owner.shape[0]):
-        clash[p, 0] = -1
+    for p in loose:
         for s in range(owner.shape[1]):
-            a = owner[p, s]
-            if a < 0:
+            particle = owner[p, s]
+            if particle < 0:
                 continue
             for e in range(starts[kind[p]], starts[kind[p] + 1]):
                 node = nodes[offsets[p] + places[e]]
-                holder = node_owner[node, s]
-                if holder < 0:
-                    node_owner[node, s] = a
-                elif holder != a:
-                    clash[p, 0] = min(a, holder)
-                    clash[p, 1] = max(a, holder)
+                high[s, node] = max(high[s, node], particle)
+                low[s, node] = min(low[s, node], particle)
 
 
 @jit

@@ -27,6 +27,7 @@ class Scheme:
         self.motion = np.zeros((self.particles, d.dim + rigid.rotations(d.dim)))
         self.touches = self.meetings = 0
         self._make_room(64)
+        self.rooms: dict[str, Floats] = {}
         self.activate(state)
 
     def activate(self, state: State) -> None:
@@ -37,7 +38,6 @@ class Scheme:
             self._activate(state)
 
     def _activate(self, state: State) -> None:
-        self.point = self.fields = np.empty((0, 0))  # free the largest arrays before the next ones are made
         self.active: Active = activate(self.d, state)
         d, a, columns = self.d, self.active, state.u.shape[1]
         self.slot_of, self.node_owner = state.slot_of, state.owner
@@ -53,9 +53,9 @@ class Scheme:
 
         # Points: fields, D and S2, loose and in blocks
         self.D, self.S2 = np.empty((2, a.loose.size))
-        self.point = np.zeros((a.loose.size * (1 + d.dim), columns))
+        self.point = self._room("point", a.loose.size * (1 + d.dim), columns)
         self.D_blocks, self.S2_blocks = np.empty((2, a.blocks.blocks.size, LANES))
-        self.fields = np.zeros((a.blocks.column.size * (1 + d.dim), LANES))
+        self.fields = self._room("fields", a.blocks.column.size * (1 + d.dim), LANES)
         self.touching = np.empty(a.live.size, dtype=np.int64)
         self.work = np.empty((1, d.shape.longest))
         self.velocity = np.zeros((d.dim, columns))
@@ -65,6 +65,12 @@ class Scheme:
         self.sums = np.zeros((self.particles, size + 1 + d.dim))
         self.forces, self.moments = self.sums[:, :size], self.sums[:, size:]
         self.carried = self.motion
+
+    def _room(self, name: str, rows: int, columns: int) -> Floats:
+        """Work space: what `name` had before where that is enough, for new memory has to be cleared page by page."""
+        if (kept := self.rooms.get(name)) is None or kept.size < rows * columns:
+            kept = self.rooms[name] = np.zeros(rows * columns + rows * columns // 16)
+        return kept[: rows * columns].reshape(rows, columns)
 
     def rates(self, u: Floats, rate: Floats, tau: float | None = None) -> None:
         """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective.

@@ -145,7 +145,8 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             return flags, owner
         claims, clashes = _claim(d, owner, clash)
         clashes = _everyones_pairs(d, clashes)
-        if len(clashes) or state.u.shape[1] > LANES:
+        fewer = compact and _fits_fewer(d, owner, state)
+        if len(clashes) or fewer:
             every = np.arange(d.nodes)
             seen = [known, clashes, slots.meeting(claims, every), slots.meeting(state.owner, every)]
             known = _everyones_pairs(d, np.concatenate(seen))
@@ -154,7 +155,7 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             slot_of = slots.recolour(slot_of, known)
             if width(int(slot_of.max()) + 1) > state.u.shape[1]:
                 slot_of = slots.colour(known, len(slot_of))
-        elif compact and state.u.shape[1] > LANES:
+        elif fewer:
             slot_of = slots.colour(known, len(slot_of))
             compact = False
         columns = width(int(slot_of.max()) + 1)
@@ -171,6 +172,14 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
 
 
+def _fits_fewer(d: Discretisation, owner: Numbers, state: State) -> bool:
+    """Whether the particles that meet at points, and perhaps all that need slots of their own, fit into fewer packs."""
+    if state.u.shape[1] == LANES:
+        return False
+    meet = _everyones_pairs(d, slots.meeting(owner, np.arange(d.shape.points)))
+    return width(int(slots.colour(meet, len(state.slot_of)).max()) + 1) < state.u.shape[1]
+
+
 def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:
     """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot."""
     near, blocks, table = d.nearest, d.blocks, d.shape
@@ -182,8 +191,9 @@ def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers,
     kernels.claim(
         high, low, owner, blocks.loose, table.offsets, table.nodes, near.kind, near.starts, near.places
     )
-    claims = np.ascontiguousarray(high[:, : d.nodes].T.astype(np.int32))
-    lowest = np.ascontiguousarray(low[:, : d.nodes].T.astype(np.int32))
+    claims, lowest = np.empty((2, d.nodes, owner.shape[1]), dtype=np.int32)
+    block_kernels.by_node(claims, high)
+    block_kernels.by_node(lowest, low)
     _spread(d, lowest, claims)
     crowded = (claims >= 0) & (lowest < claims)
     return claims, np.concatenate([clash, np.stack([lowest[crowded], claims[crowded]], axis=1)])
@@ -199,11 +209,13 @@ def _sense(d: Discretisation, state: State, flags: Numbers, owner: Numbers, clas
     )
     columns = np.zeros((state.u.shape[1], d.nodes + LANES))
     block_kernels.to_columns(columns, state.u, np.arange(d.nodes))
-    high = np.full((state.owner.shape[1], d.nodes + LANES), -1.0)
-    high[:, : d.nodes] = state.owner.T
-    low = np.where(high < 0.0, block_kernels.NOBODY, high)
+    high = np.full((owner.shape[1], d.nodes + LANES), -1.0)
+    low = np.full_like(high, block_kernels.NOBODY)
+    block_kernels.by_column(high, low, state.owner)
+    # |sum N u| and |sum grad N u| are at most max |u| times the largest sum of |N| or of |grad N| in a row of the table
+    negligible = min(least, switch.eps_eta) / d.steepest
     block_kernels.sense(
-        flags, owner, clash, columns, state.owner, high, low, switch.eps_rho, switch.eps_eta, least, blocks.points,
+        flags, owner, clash, columns, high, low, switch.eps_rho, switch.eps_eta, least, negligible, blocks.points,
         changed, blocks.begin, blocks.count, blocks.start, table.nodes, table.table,
         near.kind, near.starts, near.places,
     )

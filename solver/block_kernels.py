@@ -319,19 +319,21 @@ def divergence(
 
 @jit
 def sense(
-    flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, node_owner: Numbers, high: Floats, low: Floats,
-    eps_rho: float, eps_eta: float, least: float, points: Numbers, changed: Flags,
+    flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, high: Floats, low: Floats,
+    eps_rho: float, eps_eta: float, least: float, negligible: float, points: Numbers, changed: Flags,
     begins: Integers, counts: Integers, block_starts: Integers, nodes: Numbers, table: Floats,
     kind: Integers, starts: Integers, places: Numbers,
 ) -> None:
-    """`kernels.sense` for the points in blocks. Order parameters are 0 where nobody owns their slot.
+    """`kernels.sense` for the points in blocks.
 
-    high, low (slots, n + LANES): node_owner by columns, with -1 and with `NOBODY` where there is no owner.
+    high, low (slots, n + LANES): the owners of the nodes' slots, -1 and `NOBODY` where there is none. Fields whose
+    nodal values are below `negligible` all over a block cannot come to `least`, nor can their gradients.
     """
-    held = np.zeros(node_owner.shape[0], dtype=np.int64)
-    slots_of_eight(held, node_owner, changed)
+    held = np.zeros(changed.size, dtype=np.int64)
+    fields_of_eight(held, columns, owner.shape[1], negligible, changed)
     width = table.shape[0]
-    fields = np.empty((width, LANES))
+    fields = np.empty((2 * width, LANES))
+    present = np.empty(1 + owner.shape[1], dtype=np.int64)
     found = np.empty((2, LANES))
     exists = np.empty(LANES, dtype=np.bool_)
     for b in range(points.shape[0]):
@@ -346,20 +348,30 @@ def sense(
             if p >= 0:
                 flags[p] = 0
                 clash[p, 0] = -1
-                for s in range(node_owner.shape[1]):
+                for s in range(owner.shape[1]):
                     owner[p, s] = -1
         pattern = kind[points[b, 0]]
-        for column in range(1 + node_owner.shape[1]):
-            if column > 0 and not some >> column & 1:
-                continue
-            gather(fields, 0, columns, column, begin, counts[b], block_starts[b], nodes, table)
+        fields_here = 0
+        for column in range(1 + owner.shape[1]):
+            if column == 0 or some >> column & 1:
+                present[fields_here] = column
+                fields_here += 1
+        for i in range(fields_here):
+            column = present[i]
+            if i % 2 == 0 and i + 1 < fields_here:
+                gather_two(
+                    fields, 0, columns, column, present[i + 1], begin, counts[b], block_starts[b], nodes, table
+                )
+            elif i % 2 == 0:
+                gather(fields, 0, columns, column, begin, counts[b], block_starts[b], nodes, table)
+            row = i % 2 * width
             eps = eps_rho if column == 0 else eps_eta
             several = False
             for j in range(LANES):
                 square = 0.0
                 for k in range(1, width):
-                    square += fields[k, j] * fields[k, j]
-                exists[j] = column > 0 and (square >= least * least or abs(fields[0, j]) >= least)
+                    square += fields[row + k, j] * fields[row + k, j]
+                exists[j] = column > 0 and (square >= least * least or abs(fields[row, j]) >= least)
                 several |= exists[j]
                 if square >= eps * eps and points[b, j] >= 0:
                     flags[points[b, j]] = 1
@@ -412,16 +424,34 @@ def claim(
 
 
 @jit
-def slots_of_eight(held: Integers, node_owner: Numbers, changed: Flags) -> None:
-    """held[a], of the nodes a ... a + LANES - 1: bit 0 if one has changed, bit 1 + s if slot s is owned at one."""
+def fields_of_eight(held: Integers, columns: Floats, slots: int, least: float, changed: Flags) -> None:
+    """held[a], of the nodes a ... a + LANES - 1: bit 0 if one has changed, bit 1 + s if slot s is at least `least`."""
     for a in range(held.size):
         held[a] = changed[a]
-        for s in range(node_owner.shape[1]):
-            if node_owner[a, s] >= 0:
-                held[a] |= np.int64(1) << (1 + s)
+    for s in range(slots):
+        for a in range(held.size):
+            held[a] |= np.int64(abs(columns[1 + s, a]) >= least) << np.int64(1 + s)
     for a in range(held.size):
         for j in range(1, min(LANES, held.size - a)):
             held[a] |= held[a + j]
+
+
+@jit
+def by_node(values: Numbers, columns: Floats) -> None:
+    """values[a, s] = columns[s, a]."""
+    for a in range(values.shape[0]):
+        for s in range(values.shape[1]):
+            values[a, s] = np.int32(columns[s, a])
+
+
+@jit
+def by_column(high: Floats, low: Floats, node_owner: Numbers) -> None:
+    """high[s, a] and low[s, a] = node_owner[a, s]; where that is -1, they stay."""
+    for a in range(node_owner.shape[0]):
+        for s in range(node_owner.shape[1]):
+            if node_owner[a, s] >= 0:
+                high[s, a] = node_owner[a, s]
+                low[s, a] = node_owner[a, s]
 
 
 @jit

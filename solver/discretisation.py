@@ -31,6 +31,7 @@ class Discretisation:
     shape: ShapeTable
     blocks: Blocks
     nearest: Nearest
+    steepest: float  # the largest of sum_a |N_a| = 1 and sum_a |grad N_a| at any point of any rank, 1/nm
     positions: Floats  # (n, dim) of this rank's nodes, nm
     x: Floats  # (p, dim)
     weights: Floats  # (p,) nm^dim
@@ -86,10 +87,17 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
     return Discretisation(
-        case, share, table, find_blocks(table, x, shared), nearest(table, NEAR),
+        case, share, table, find_blocks(table, x, shared), nearest(table, NEAR), steepest(table, ranks),
         mesh.nodes[nodes], x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
+
+
+def steepest(table: ShapeTable, ranks: Ranks) -> float:
+    """The largest of 1 and of sum_a |grad N_a| (all components' absolute values) over the points of all ranks."""
+    most = np.ones(1)
+    kernels.largest_slope(most, table.table, np.unique(table.rows), table.longest)
+    return float(ranks.max(most)[0])
 
 
 def _check_mass(mesh: Mesh, share: Share, mass: Floats) -> None:

@@ -531,21 +531,33 @@ def watch_nodes(
     """watch[a]: bit 0 where a switched-off point needs node a, bit 1 + s where a live point near it lacks slot s.
 
     These nodal values decide whether the set of live points and slots still holds. A node counts as near where its
-    N_a(x_p) is at least half the largest of the point: farther ones say little of the slot's value there.
+    N_a(x_p) is at least half the largest of the point: farther ones say little of the slot's value there. A slot that
+    exists at the point is the same particle's at the nodes near it.
     """
+    owned = np.zeros(node_owner.shape[0], dtype=np.int64)
+    for a in range(owned.size):
+        owned[a] = slots_of(node_owner, a)
     for p in range(flags.size):
         if not flags[p]:
             for e in range(offsets[p], offsets[p + 1]):
                 watch[nodes[e]] |= 1
             continue
+        missing = ~slots_of(owner, p)
         largest = table[0, rows[p] + places[starts[kind[p]]]]
         for e in range(starts[kind[p]], starts[kind[p] + 1]):
             if table[0, rows[p] + places[e]] < 0.5 * largest:
                 break
             a = nodes[offsets[p] + places[e]]
-            for s in range(owner.shape[1]):
-                if node_owner[a, s] >= 0 and owner[p, s] != node_owner[a, s]:
-                    watch[a] |= np.int64(1) << (1 + s)
+            watch[a] |= owned[a] & missing
+
+
+@inlined
+def slots_of(owner: Numbers, i: int) -> int:
+    """Bit 1 + s where slot s of row i has an owner."""
+    bits = np.int64(0)
+    for s in range(owner.shape[1]):
+        bits |= np.int64(owner[i, s] >= 0) << np.int64(1 + s)
+    return bits
 
 
 @jit
@@ -636,6 +648,18 @@ def add_moments(
                 moments[a, 0] += mass[b] * eta
                 for k in range(first_moment.shape[1]):
                     moments[a, 1 + k] += first_moment[b, k] * eta
+
+
+@jit
+def largest_slope(most: Floats, table: Floats, starts: Integers, longest: int) -> None:
+    """most[0] becomes the largest sum of |dN/dx| + |dN/dy| [+ |dN/dz|] over a row, starts[i] its first column."""
+    for i in range(starts.size):
+        end = starts[i + 1] if i + 1 < starts.size else table.shape[1]
+        total = 0.0
+        for e in range(starts[i], min(end, starts[i] + longest)):
+            for k in range(1, table.shape[0]):
+                total += abs(table[k, e])
+        most[0] = max(most[0], total)
 
 
 @jit

@@ -138,17 +138,19 @@ class Scheme:
     def _potential(self, u: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
         """The part of `_gather` for some of the loose points and blocks."""
         d, a, table = self.d, self.active, self.d.shape
-        self.touches = kernels.potential(
-            self.W, self.touching, self.point, self.D, self.S2, u, a.loose, a.mask, a.present, a.several,
-            d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
-            *loose, self.touches,
-        )
-        self.touches = block_kernels.potential(
-            self.W_row, self.touching, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
-            a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.mask, a.blocks.partial,
-            d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table, d.coefficients,
-            *blocks, self.touches,
-        )
+        if loose[0] < loose[1]:
+            self.touches = kernels.potential(
+                self.W, self.touching, self.point, self.D, self.S2, u, a.loose, a.mask, a.present, a.several,
+                d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
+                *loose, self.touches,
+            )
+        if blocks[0] < blocks[1]:
+            self.touches = block_kernels.potential(
+                self.W_row, self.touching, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
+                a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.mask, a.blocks.partial,
+                d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table, d.coefficients,
+                *blocks, self.touches,
+            )
 
     def _scatter(self, rate: Floats) -> None:
         """Sources and fluxes of all points in rate, times m_a, after `_gather` and once the motion is known."""
@@ -169,17 +171,19 @@ class Scheme:
         """The part of `_scatter` for some of the loose points and blocks; those of the blocks go to `rate_columns`."""
         d, a, table = self.d, self.active, self.d.shape
         moving = d.case.model.rigid_motion
-        kernels.divergence(
-            rate, self.point, self.D, self.S2, self.W, motion, self.velocity,
-            a.loose, a.owner, a.present, d.weights, d.x,
-            table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang, *loose,
-        )
-        block_kernels.divergence(
-            self.rate_columns, self.fields, self.D_blocks, self.S2_blocks, self.W_row, motion,
-            a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.particle, a.blocks.owner,
-            d.blocks.x, d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table,
-            d.coefficients, moving, d.huang, *blocks,
-        )
+        if loose[0] < loose[1]:
+            kernels.divergence(
+                rate, self.point, self.D, self.S2, self.W, motion, self.velocity,
+                a.loose, a.owner, a.present, d.weights, d.x,
+                table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang, *loose,
+            )
+        if blocks[0] < blocks[1]:
+            block_kernels.divergence(
+                self.rate_columns, self.fields, self.D_blocks, self.S2_blocks, self.W_row, motion,
+                a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.particle, a.blocks.owner,
+                d.blocks.x, d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table,
+                d.coefficients, moving, d.huang, *blocks,
+            )
 
     def _meet(self) -> None:
         """The pairs of particles that touch at this rank's points, after `_gather`; room for more is made if needed."""

@@ -100,16 +100,18 @@ def meeting(owner: Numbers, chosen: Integers) -> Integers:
     """Every pair of particles that one of the chosen rows of owner holds together, once: (pairs, 2)."""
     seen = {np.int64(-1)}
     last = np.int64(-1)
+    here = np.empty(owner.shape[1], dtype=np.int64)
     for p in chosen:
+        count = 0
         for s in range(owner.shape[1]):
+            here[count] = owner[p, s]
+            count += owner[p, s] >= 0
+        for s in range(count):
             for t in range(s):
-                a = np.int64(owner[p, s])
-                b = np.int64(owner[p, t])
-                if a >= 0 and b >= 0:
-                    code = min(a, b) << 32 | max(a, b)
-                    if code != last:  # mostly it is the pair of the row before
-                        seen.add(code)
-                        last = code
+                code = min(here[s], here[t]) << 32 | max(here[s], here[t])
+                if code != last:  # mostly it is the pair of the row before
+                    seen.add(code)
+                    last = code
     pairs = np.empty((len(seen) - 1, 2), dtype=np.int64)
     count = 0
     for code in seen:

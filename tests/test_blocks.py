@@ -142,7 +142,7 @@ def test_rates_are_those_of_single_points(
     np.testing.assert_array_equal(together.watch, alone.watch)
     exact = rates_of(single, same)
     rate = rates_of(scheme, state)
-    mixed = np.where(together.blocks.particle >= 0, MIXED, -1)  # as if lanes had different particles: each looks for its
+    mixed = np.where(together.blocks.particle >= 0, MIXED, -1)  # as if lanes had different particles
     scheme.active = replace(together, blocks=replace(together.blocks, particle=mixed.astype(np.int32)))
     np.testing.assert_allclose(rates_of(scheme, state), rate, rtol=0, atol=1e-13 * np.abs(rate).max())
     for column in range(rate.shape[1]):

@@ -16,7 +16,7 @@ from .state import State
 
 LOWEST, HIGHEST = -0.5, 1.5  # fields outside these are not physics any more
 SAME_TIME = 1e-9  # of the end: output times nearer than this are one
-LAG = 400.0  # eps that a watched value may move before the set of live points is made anew
+LAG = 300.0  # eps that a watched value may move before the set of live points is made anew
 UNEVEN = 0.1  # growth of the imbalance, as a part of the mean work, after which the mesh is divided anew
 REFRESH = 50  # steps after which points that have come to rest are switched off
 

@@ -151,14 +151,19 @@ def kill_one(kind: str, running: Service, random_: random.Random) -> bool:
 
 
 def disturb(running: Service, kills: int, seconds: float, seed: int) -> Counter[str]:
-    """Kill `kills` times within about `seconds`, or until all jobs are done; a killed service is started again."""
+    """Kill `kills` times within about `seconds`, or until all jobs are done; a killed service is started again.
+
+    Victims of all kinds come in turn, at random; one that is not there yet is waited for, and no work is done meanwhile.
+    """
     random_, counts = random.Random(seed), Counter[str]()
     began = time.monotonic()
     for moment in sorted(random_.uniform(0.0, seconds) for _ in range(kills)):
         time.sleep(max(0.0, began + moment - time.monotonic()))
-        while not kill_one(kind := random_.choice(VICTIMS), running, random_):
+        kind = random_.choice(VICTIMS)
+        while not kill_one(kind, running, random_):
             if all_done(running.data):
                 return counts
+            time.sleep(0.02)
         counts[kind] += 1
         if kind == "service":
             time.sleep(random_.uniform(0.0, seconds / kills))

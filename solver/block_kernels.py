@@ -12,7 +12,7 @@ from .arrays import Flags, Floats, Integers, Numbers
 from .energy import Coefficients, df_deta, df_drho, mobility
 from .jit import inlined, jit
 from .kernels import touching_share, x_velocity, y_velocity, z_velocity
-from .simd import LANES, load, positive, splat, store
+from .simd import LANES, flush_denormals, load, positive, restore_denormals, splat, store
 
 NOBODY = 1e9  # more than any number of a particle: those of several are compared as floats, eight at a time
 
@@ -143,6 +143,7 @@ def potential(
     W (1, n + LANES) gets their shares. touching gets -1 - (LANES l + j) for lane j of block l where particles may
     touch; returned: `touches` and those.
     """
+    mode = flush_denormals()
     width = table.shape[0]
     overlaps = np.empty((1, LANES))
     flow = np.empty((4, LANES))
@@ -191,6 +192,7 @@ def potential(
                 if overlaps[0, j] > m.c and live_weights[l, j] > 0.0:
                     touching[touches] = -1 - (LANES * l + j)
                     touches += 1
+    restore_denormals(mode)
     return touches
 
 
@@ -251,6 +253,7 @@ def divergence(
 
     Fields go two by two, rho last: its flux needs what all order parameters are swept along with.
     """
+    mode = flush_denormals()
     width = table.shape[0]
     dim = width - 1
     slope = np.empty((width, LANES))
@@ -315,6 +318,7 @@ def divergence(
             scatter(rate, 0, flow, 0, begin, count, start, nodes, table)
         else:
             scatter_two(rate, column[held], 0, flow, begin, count, start, nodes, table)
+    restore_denormals(mode)
 
 
 @jit

@@ -15,7 +15,18 @@ import numpy as np
 from .arrays import Bytes, Flags, Floats, Integers, Numbers
 from .energy import Coefficients, Field, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
-from .simd import LANES, first, load, positive, splat, store, total, with_first
+from .simd import (
+    LANES,
+    first,
+    flush_denormals,
+    load,
+    positive,
+    restore_denormals,
+    splat,
+    store,
+    total,
+    with_first,
+)
 
 
 @inlined
@@ -121,6 +132,7 @@ def potential(
     W (n,) gets partial sums; point, D and squares = S2 are filled, and touching from `touches` on with the l of the
     points where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2. Returned: `touches` and those.
     """
+    mode = flush_denormals()
     width = table.shape[0]
     for l in range(low, high):
         p = loose[l]
@@ -160,6 +172,7 @@ def potential(
         if overlap > m.c:
             touching[touches] = l
             touches += 1
+    restore_denormals(mode)
     return touches
 
 
@@ -349,6 +362,7 @@ def divergence(
     eta_a: source -L df/deta_a,    flux -L kappa_eta grad eta_a + eta_a v_a,    v_a = V_a(x) eta_a
     velocity (dim, F) is work space with zeros in column 0.
     """
+    mode = flush_denormals()
     dim = x.shape[1]
     advection = np.zeros(3)
     slope = np.zeros(3)
@@ -382,6 +396,7 @@ def divergence(
                     flux = with_first(flux, rho * advection[k] - D[l] * slope[k])
                 store(point, row + 1 + k, column, w * flux)
             scatter(rate, point, row, begin, count, start, nodes, table, column)
+    restore_denormals(mode)
 
 
 @jit
@@ -735,10 +750,12 @@ def clear(array: Floats, listed: Integers) -> None:
 @jit
 def scale(array: Floats, factors: Floats, listed: Integers) -> None:
     """array[a, :] *= factors[a, :] at the listed nodes."""
+    mode = flush_denormals()
     for i in range(listed.size):
         a = listed[i]
         for column in range(0, array.shape[1], LANES):
             store(array, a, column, load(factors, a, column) * load(array, a, column))
+    restore_denormals(mode)
 
 
 @jit
@@ -751,10 +768,12 @@ def divide_values(array: Floats, mass: Floats, listed: Integers) -> None:
 @jit
 def advance(new: Floats, old: Floats, dt: float, rate: Floats, listed: Integers) -> None:
     """new = old + dt rate at the listed nodes."""
+    mode = flush_denormals()
     for i in range(listed.size):
         a = listed[i]
         for column in range(0, new.shape[1], LANES):
             store(new, a, column, load(old, a, column) + dt * load(rate, a, column))
+    restore_denormals(mode)
 
 
 @jit
@@ -792,11 +811,13 @@ def chebyshev_stage(
     new: Floats, old: Floats, before: Floats, last: Floats, rate: Floats, rate_0: Floats, c: Floats, listed: Integers
 ) -> None:
     """new = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0 at the listed nodes."""
+    mode = flush_denormals()
     for i in range(listed.size):
         a = listed[i]
         for column in range(0, new.shape[1], LANES):
             y = c[0] * load(old, a, column) + c[1] * load(last, a, column) + c[2] * load(before, a, column)
             store(new, a, column, y + c[3] * load(rate, a, column) + c[4] * load(rate_0, a, column))
+    restore_denormals(mode)
 
 
 @jit

@@ -44,7 +44,7 @@ class Division:
 
 
 def boxes(size: tuple[float, ...], parts: int) -> list[Box]:
-    """The box [0, size] cut in two across its longest side, and again, as often as there are parts."""
+    """The box [0, size] cut in two across its longest side (the last of equal ones), and again, as often as there are parts."""
     done: list[Box] = []
     todo: list[tuple[Box, int]] = [((tuple(0.0 for _ in size), size), parts)]
     while todo:
@@ -53,7 +53,7 @@ def boxes(size: tuple[float, ...], parts: int) -> list[Box]:
             done.append((low, high))
             continue
         left = count // 2
-        axis = max(range(len(size)), key=lambda k: high[k] - low[k])
+        axis = max(reversed(range(len(size))), key=lambda k: high[k] - low[k])
         cut = low[axis] + (high[axis] - low[axis]) * left / count
         middle_high = (*high[:axis], cut, *high[axis + 1 :])
         middle_low = (*low[:axis], cut, *low[axis + 1 :])

@@ -153,7 +153,7 @@ def kill_one(kind: str, running: Service, random_: random.Random) -> bool:
 def disturb(running: Service, kills: int, seconds: float, seed: int) -> Counter[str]:
     """Kill `kills` times within about `seconds`, or until all jobs are done; a killed service is started again.
 
-    Victims of all kinds come in turn, at random; one that is not there yet is waited for, and no work is done meanwhile.
+    Victims of all kinds come in turn, at random; one that is not there is waited for, and no work is done meanwhile.
     """
     random_, counts = random.Random(seed), Counter[str]()
     began = time.monotonic()

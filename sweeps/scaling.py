@@ -44,7 +44,7 @@ class Division:
 
 
 def boxes(size: tuple[float, ...], parts: int) -> list[Box]:
-    """The box [0, size] cut in two across its longest side (the last of equal ones), and again, as often as there are parts."""
+    """The box [0, size] cut in two across its longest side (of equal ones the last) as often as there are parts."""
     done: list[Box] = []
     todo: list[tuple[Box, int]] = [((tuple(0.0 for _ in size), size), parts)]
     while todo:

@@ -33,7 +33,7 @@ from .launch import Launch, LaunchError, Outcome, find_mpirun, is_open_mpi, kill
 
 LONGEST = 65_536  # bytes of an order
 PROGRESS_EVERY = 0.5  # seconds between two writes of progress.json
-STUBBORN = 60.0  # seconds for which an exit record that cannot be written (a full disk) is tried again
+STUBBORN = 60.0  # seconds for which a record that cannot be written (a full disk) is tried again
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 prctl = ctypes.CDLL(None).prctl
 STOPS = {"cancelled": Move.STOP, "timed_out": Move.TIME_OUT, "released": Move.RELEASE}
@@ -117,14 +117,14 @@ class Runner:
         order, pid = self.order, os.getpid()
         record: dict[str, Any] = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
         record |= {"cores": order.cores, "started": time.time()}
-        write_json(self.directory / "attempt.json", record, durable=False)  # it tells of a process of this boot
+        self.write("attempt.json", record, durable=False)  # it tells of a process of this boot
         try:
             move, message = self.attempt()
         except Exception as error:
             traceback.print_exc()
             move, message = Move.BREAK, f"runner: {type(error).__name__}: {error}"
         seconds = (time.monotonic() - self.began) * order.ranks
-        self.write(Exit(order.attempt, move, message, time.time(), seconds))
+        self.write("exit.json", asdict(Exit(order.attempt, move, message, time.time(), seconds)))
 
     def attempt(self) -> tuple[Move, str | None]:
         """Run mpirun to its end; what came of it."""
@@ -216,12 +216,12 @@ class Runner:
             with suppress(OSError):  # a full disk does not end a run that can go on
                 write_json(self.directory / "progress.json", progress, durable=False)
 
-    def write(self, end: Exit) -> None:
-        """The exit record; a full disk may get room again."""
+    def write(self, name: str, tree: dict[str, Any], durable: bool = True) -> None:
+        """A record without which the attempt counts as lost; a full disk may get room again."""
         deadline = time.monotonic() + STUBBORN
         while True:
             try:
-                return write_json(self.directory / "exit.json", asdict(end))
+                return write_json(self.directory / name, tree, durable)
             except OSError:
                 if time.monotonic() > deadline:
                     raise

@@ -177,7 +177,7 @@ def _fits_fewer(d: Discretisation, owner: Numbers, state: State) -> bool:
     if state.u.shape[1] == LANES:
         return False
     meet = _everyones_pairs(d, slots.meeting(owner, np.arange(d.shape.points)))
-    return width(int(slots.colour(meet, len(state.slot_of)).max()) + 1) < state.u.shape[1]
+    return bool(width(int(slots.colour(meet, len(state.slot_of)).max()) + 1) < state.u.shape[1])
 
 
 def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:

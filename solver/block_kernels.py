@@ -376,7 +376,8 @@ def sense(
                 for k in range(1, width):
                     square += fields[row + k, j] * fields[row + k, j]
                 exists[j] = column > 0 and (square >= least * least or abs(fields[row, j]) >= least)
-                several |= exists[j]
+                if exists[j]:
+                    several = True
                 if square >= eps * eps and points[b, j] >= 0:
                     flags[points[b, j]] = 1
             if not several:
@@ -414,7 +415,8 @@ def claim(
                 particle = owner[p, s] if p >= 0 else np.int32(-1)
                 mine[0, j] = particle
                 mine[1, j] = particle if particle >= 0 else NOBODY
-                some |= particle >= 0
+                if particle >= 0:
+                    some = True
             if not some:
                 continue
             largest = load(mine, 0, 0)

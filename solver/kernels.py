@@ -572,7 +572,7 @@ def slots_of(owner: Numbers, i: int) -> int:
     bits = np.int64(0)
     for s in range(owner.shape[1]):
         bits |= np.int64(owner[i, s] >= 0) << np.int64(1 + s)
-    return bits
+    return int(bits)
 
 
 @jit

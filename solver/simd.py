@@ -17,7 +17,6 @@ from typing import Any, Protocol, TypeVar, cast
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 from .arrays import Floats
@@ -168,7 +167,8 @@ def _flush_denormals(typing: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.IntType(32)
-        mode = cgutils.alloca_once_value(builder, ir.Constant(kind, 0))
+        mode = builder.alloca(kind)
+        builder.store(ir.Constant(kind, 0), mode)
         _control(builder, "stmxcsr", mode)
         before = builder.load(mode)
         builder.store(builder.or_(before, ir.Constant(kind, FLUSH)), mode)
@@ -183,7 +183,9 @@ def _restore_denormals(typing: Any, before: Any) -> Any:
     """restore_denormals(before): undo `flush_denormals`."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        _control(builder, "ldmxcsr", cgutils.alloca_once_value(builder, arguments[0]))
+        mode = builder.alloca(arguments[0].type)
+        builder.store(arguments[0], mode)
+        _control(builder, "ldmxcsr", mode)
         return context.get_dummy_value()
 
     return types.void(types.int32), generate

@@ -75,8 +75,7 @@ def activate(d: Discretisation, state: State) -> Active:
     high = np.full(d.nodes, -1, dtype=np.int64)
     kernels.interiors(low, high, flags, owner, state.u, table.offsets, table.nodes, table.rows, table.table)
     _spread(d, low, high)
-    if (low < high).any():
-        kernels.switch_on(flags, low < high, table.offsets, table.nodes)
+    kernels.switch_on(flags, low < high, table.offsets, table.nodes)
     live = np.flatnonzero(flags)
     loose = d.blocks.loose[flags[d.blocks.loose] != 0]
     mask = np.zeros((loose.size, state.u.shape[1]))

@@ -704,6 +704,8 @@ def touch(touched: Bytes, chosen: Flags, offsets: Integers, nodes: Numbers) -> N
 @jit
 def switch_on(flags: Numbers, marked: Flags, offsets: Integers, nodes: Numbers) -> None:
     """flags[p] = 1 at the points that see a marked node."""
+    if not marked.any():
+        return
     for p in range(flags.size):
         for e in range(offsets[p], offsets[p + 1]):
             if marked[nodes[e]]:

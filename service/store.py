@@ -740,7 +740,9 @@ def _engine(path: Path, writer: bool) -> Engine:
     @sa.event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
         connection.isolation_level = None  # BEGIN is ours
-        own = ("journal_mode = WAL", "synchronous = FULL") if writer else ("query_only = ON", "wal_autocheckpoint = 0")
+        if writer:
+            _keep_a_log(connection)
+        own = ("synchronous = FULL",) if writer else ("query_only = ON", "wal_autocheckpoint = 0")
         for pragma in (*own, "foreign_keys = ON", "mmap_size = 0"):
             connection.execute(f"PRAGMA {pragma}")
 
@@ -749,6 +751,19 @@ def _engine(path: Path, writer: bool) -> Engine:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writer else "BEGIN")
 
     return engine
+
+
+def _keep_a_log(connection: sqlite3.Connection) -> None:
+    """WAL mode. For this switch alone SQLite does not wait where another program writes."""
+    last = time.monotonic() + BUSY
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if _code(error) != sqlite3.SQLITE_BUSY or time.monotonic() > last:
+                raise
+        time.sleep(0.01)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -306,3 +307,15 @@ def test_two_that_open_at_once_make_one_good_index(tmp_path: Path) -> None:
         assert version(folder / "frit.db") == NEWEST
         assert sorted(row["name"] for row in rows(folder / "frit.db", "jobs")) == ["job 0", "job 1"]
         assert is_whole(folder / "frit.db")
+
+
+def test_the_switch_to_a_log_waits_for_another_that_writes(tmp_path: Path) -> None:
+    migrations.prepare(tmp_path / "frit.db")
+    with closing(sqlite3.connect(tmp_path / "frit.db", isolation_level=None, check_same_thread=False)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        later = threading.Timer(0.3, other.execute, ["ROLLBACK"])
+        later.start()
+        with opened(tmp_path) as store:
+            done(store.submit(new(1)))
+        later.join()
+        assert other.execute("PRAGMA journal_mode").fetchone() == ("wal",)

@@ -256,6 +256,8 @@ def report(
         for key, value in summary.items():
             values = value if isinstance(value, list) else [value]
             typer.echo(f"{key.replace('_', ' '):15}{' -> '.join(map(cell, values))}")
+    for note in read_record(directory).get("notes", []):
+        typer.echo(f"note: {note}", err=True)
     if outcome.state in ("failed", "refused"):
         log = directory / "log.txt"
         lines = [outcome.errors, outcome.message, f"see {log}" if log.exists() else None]

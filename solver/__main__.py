@@ -30,7 +30,7 @@ from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
 from .prepare import build_mesh, make_integrator, prepare
-from .run import Ending, RunError, run
+from .run import Ending, RunError, piled_up, run
 from .scheme import Scheme
 from .shape import ShapeError
 from .state import State
@@ -198,10 +198,15 @@ class Recorder:
         self.snapshots = output.Snapshots(directory, case, mesh, self.collector, fresh)
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
         self.latest: dict[str, Any] = {}  # history row
+        self.noted = False  # that a particle is pressed against a wall
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
 
     def history(self, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
         """Append a row."""
+        if not self.noted and (note := piled_up(scheme, state)):
+            self.noted = True
+            if self.ranks.root:
+                record_note(self.directory, note)
         row = self.observables.row(scheme, state, u, time_, self._wall_time())
         self.latest = row
         if self.rows is not None:
@@ -275,6 +280,7 @@ def record_start(
         "host": socket.gethostname(),
         "seeds": {"particles": case.particles.seed},
         "packing": packing or before.get("packing"),
+        "notes": before.get("notes", []),
         "versions": versions(),
         "start": before.get("start", output.now()),
         "resumed": [*before.get("resumed", []), *([] if fresh else [output.now()])],
@@ -298,6 +304,15 @@ def record_end(
         log.write(f"{output.now()} {state}{': ' + message if message else ''}\n")
     if message:
         print(f"{state}: {message}", file=sys.stderr, flush=True)
+
+
+def record_note(directory: Path, note: str) -> None:
+    """What a user should know of a run that goes on, into run.json and log.txt."""
+    path = directory / "run.json"
+    record: dict[str, Any] = json.loads(path.read_text())
+    output.write_json(path, record | {"notes": [*record["notes"], note]})
+    with open(directory / "log.txt", "a") as log:
+        log.write(f"{output.now()} note: {note}\n")
 
 
 def versions() -> dict[str, str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import kernels
-from .arrays import Floats, Numbers
+from .arrays import Flags, Floats, Numbers
 from .blocks import Blocks, find_blocks
 from .case import Case
 from .energy import Coefficients
@@ -33,6 +33,7 @@ class Discretisation:
     nearest: Nearest
     steepest: float  # the largest of sum_a |N_a| = 1 and sum_a |grad N_a| at any point of any rank, 1/nm
     positions: Floats  # (n, dim) of this rank's nodes, nm
+    at_wall: Flags  # (n,) those within one spacing of a wall
     x: Floats  # (p, dim)
     weights: Floats  # (p,) nm^dim
     mass: Floats  # (n,) m_a = sum_p w_p N_a(x_p) over all ranks   (22)
@@ -77,7 +78,8 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     local[nodes] = np.arange(nodes.size, dtype=np.int32)
     kernels.renumber(table.nodes, local)
     share = Share(ranks, points, nodes, Halo(ranks, nodes), len(mesh.nodes))
-    x = mesh.points[points] - 0.5 * np.asarray(case.domain.size)
+    size = np.asarray(case.domain.size)
+    x = mesh.points[points] - 0.5 * size
     weights = np.ascontiguousarray(mesh.weights[points])
     mass, first_moment = np.zeros(nodes.size), np.zeros((nodes.size, x.shape[1]))
     kernels.nodal_moments(mass, first_moment, weights, x, table.offsets, table.nodes, table.rows, table.table)
@@ -86,9 +88,11 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     share.halo.add(mass)
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
+    positions = mesh.nodes[nodes]
+    at_wall = np.asarray((np.minimum(positions, size - positions) <= mesh.spacing.max()).any(axis=1))
     return Discretisation(
         case, share, table, find_blocks(table, x, shared), nearest(table, NEAR), steepest(table, ranks),
-        mesh.nodes[nodes], x, weights, mass, first_moment,
+        positions, at_wall, x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
 

@@ -798,12 +798,12 @@ def largest_change(
 
 
 @jit
-def first_outside(u: Floats, listed: Integers, low: float, high: float) -> int:
-    """The first listed node with a field outside [low, high] or not a number, or -1."""
+def first_outside(u: Floats, listed: Integers, at_wall: Flags, low: float, high: float, rho_at_wall: float) -> int:
+    """The first listed node with a field outside [low, high] or not a number, or -1; for rho at walls high differs."""
     for i in range(listed.size):
         a = listed[i]
         for c in range(u.shape[1]):
-            if not (low <= u[a, c] <= high):
+            if not (low <= u[a, c] <= (rho_at_wall if c == 0 and at_wall[a] else high)):
                 return int(a)
     return -1
 

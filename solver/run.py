@@ -11,13 +11,16 @@ from . import kernels
 from .arrays import Floats
 from .case import Case
 from .integrators import Integrator
+from .partition import Ranks
 from .scheme import Scheme
 from .state import State
 
 LOWEST, HIGHEST = -0.5, 1.5  # fields outside these are not physics any more
+HIGHEST_AT_WALL = 3.0  # but for rho at a wall: nothing there holds a particle that is pressed on; see `piled_up`
 SAME_TIME = 1e-9  # of the end: output times nearer than this are one
 LAG = 300.0  # eps that a watched value may move before the set of live points is made anew
 UNEVEN = 0.1  # growth of the imbalance, as a part of the mean work, after which the mesh is divided anew
+PRESSED = "a particle is pressed against the wall, which holds nothing back: leave room between particles and walls"
 REFRESH = 50  # steps after which points that have come to rest are switched off
 
 
@@ -131,30 +134,57 @@ def renew(scheme: Scheme, state: State) -> bool:
 
 
 def check(scheme: Scheme, state: State) -> None:
-    """Raise RunError on every rank where a field is not a number or outside [-0.5, 1.5]. Collective."""
+    """Raise RunError on every rank where a field is not a number or outside its range. Collective."""
     d = scheme.d
-    bad = kernels.first_outside(state.u, scheme.active.nodes, LOWEST, HIGHEST)
-    worst = np.array([-1.0 if bad < 0 else float(d.share.nodes[bad])])
-    d.share.ranks.max(worst)
+    bad = kernels.first_outside(state.u, scheme.active.nodes, d.at_wall, LOWEST, HIGHEST, HIGHEST_AT_WALL)
+    worst = d.share.ranks.max(np.array([-1.0 if bad < 0 else float(d.share.nodes[bad])]))
     if worst[0] < 0.0:
         return
     here = np.flatnonzero(d.share.nodes == int(worst[0]))
-    mine = describe(scheme, state, int(here[0])) if here.size else None
-    reports = [report for report in d.share.ranks.everyones(np.array([mine], dtype=object)) if report[0] is not None]
-    raise RunError(reports[0][0])
+    raise RunError(_said(d.share.ranks, describe(scheme, state, int(here[0])) if here.size else None))
 
 
-def describe(scheme: Scheme, state: State, node: int) -> str:
-    """Time, step, place and likely cause of a bad value at a node of this rank."""
+def piled_up(scheme: Scheme, state: State) -> str | None:
+    """Where rho exceeds `HIGHEST` at a wall, or None. Collective.
+
+    The flux through a wall is zero, but nothing stops a particle that its neighbours push there: what it carries
+    piles up in the outermost nodes, and spreads again when the push ends. That is the model, so the run goes on.
+    """
+    d = scheme.d
+    rho = np.where(d.at_wall, state.u[:, 0], -np.inf)
+    most = d.share.ranks.max(np.array([rho.max(initial=-np.inf)]))
+    if not most[0] > HIGHEST:
+        return None
+    here = np.flatnonzero(rho == most[0])
+    return _said(d.share.ranks, f"{fields_at(scheme, state, int(here[0]))}: {PRESSED}" if here.size else None)
+
+
+def _said(ranks: Ranks, mine: str | None) -> str:
+    """What the first rank that has something to say says. Collective."""
+    said: list[str] = [text[0] for text in ranks.everyones(np.array([mine], dtype=object)) if text[0] is not None]
+    return said[0]
+
+
+def fields_at(scheme: Scheme, state: State, node: int) -> str:
+    """Time, step, place and fields of a node of this rank."""
     place = ", ".join(f"{x:.3f}" for x in scheme.d.positions[node])
     fields = [f"rho = {state.u[node, 0]:.4g}"]
     fields += [
         f"eta of particle {a} = {state.u[node, 1 + s]:.4g}" for s, a in enumerate(state.owner[node]) if a >= 0
     ]
+    return (
+        f"at t = {state.time:.6g}, step {state.step}, node {scheme.d.share.nodes[node]} at ({place}) nm: "
+        f"{', '.join(fields)}"
+    )
+
+
+def describe(scheme: Scheme, state: State, node: int) -> str:
+    """Time, step, place and likely cause of a bad value at a node of this rank."""
     cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
     if scheme.d.case.model.rigid_motion:
         cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
-    return (
-        f"at t = {state.time:.6g}, step {state.step}, node {scheme.d.share.nodes[node]} at ({place}) nm: "
-        f"{', '.join(fields)} left [{LOWEST:g}, {HIGHEST:g}]; likely cause: {cause}"
-    )
+    limits = f"[{LOWEST:g}, {HIGHEST:g}]"
+    if scheme.d.at_wall[node]:
+        limits += f" (rho at a wall: {HIGHEST_AT_WALL:g})"
+        cause = f"{PRESSED}, or {cause}" if scheme.d.case.model.rigid_motion else cause
+    return f"{fields_at(scheme, state, node)} left {limits}; likely cause: {cause}"

@@ -99,19 +99,23 @@ def move(new_u: Floats, new_owner: Numbers, u: Floats, owner: Numbers, slot_of: 
 def meeting(owner: Numbers, chosen: Integers) -> Integers:
     """Every pair of particles that one of the chosen rows of owner holds together, once: (pairs, 2)."""
     seen = {np.int64(-1)}
-    last = np.int64(-1)
+    before = np.int64(-1)
     here = np.empty(owner.shape[1], dtype=np.int64)
     for p in chosen:
+        if before >= 0:
+            differs = np.int32(0)
+            for s in range(owner.shape[1]):
+                differs |= owner[p, s] ^ owner[before, s]
+            if differs == 0:
+                continue
+        before = p
         count = 0
         for s in range(owner.shape[1]):
             here[count] = owner[p, s]
             count += owner[p, s] >= 0
         for s in range(count):
             for t in range(s):
-                code = min(here[s], here[t]) << 32 | max(here[s], here[t])
-                if code != last:  # mostly it is the pair of the row before
-                    seen.add(code)
-                    last = code
+                seen.add(min(here[s], here[t]) << 32 | max(here[s], here[t]))
     pairs = np.empty((len(seen) - 1, 2), dtype=np.int64)
     count = 0
     for code in seen:

@@ -93,6 +93,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "wrong.toml").write_text(CASE.replace("radii = [5.0", "radii = [-5.0"))
     unstable = PAIR | {"time": {"integrator": "rk2", "end": 10.0, "step": 0.5}, "output": {"history_every": 0.5}}
     (folder / "unstable.json").write_text(json.dumps(unstable))
+    pressed = {
+        "name": "pressed", "domain": {"size": [16.0, 10.0]}, "nodes": {"spacing": 1.0}, "model": {"rho_0": 0.5},
+        "particles": {"centres": [[4.0, 5.0], [12.0, 5.0]], "radii": [4.0, 4.0]}, "time": {"end": 0.3},
+        "output": {"history_every": 0.05},
+    }  # fmt: skip
+    (folder / "pressed.json").write_text(json.dumps(pressed))
     status, out, err = frit(folder, "run", "pair.toml")
     assert (status, err) == (0, ""), out + err
     (folder / "said").write_text(out)
@@ -166,6 +172,17 @@ def test_a_run_that_fails_ends_with_1_and_the_reason(folder: Path) -> None:
     assert json.loads(out)["state"] == "failed"
     for words in ("step 1, node ", "likely cause", "see runs/unstable/log.txt"):
         assert words in err
+
+
+def test_a_particle_pressed_against_a_wall_is_noted_once(folder: Path) -> None:
+    """By a run on two ranks."""
+    status, out, err = frit(folder, "run", "pressed.json", "--ranks", "2")
+    assert status == 0, out + err
+    (note,) = record(folder / "runs/pressed")["notes"]
+    assert re.fullmatch(r"at t = 0\.\d+, step \d+, node \d+ at .* nm: rho = 1\.\d+, .*: a particle is pressed .*", note)
+    assert err == f"note: {note}\n"
+    log = (folder / "runs/pressed/log.txt").read_text()
+    assert log.count("note: ") == log.count(note) == 1
 
 
 def test_ctrl_c_ends_with_130_and_the_way_to_go_on(folder: Path) -> None:

@@ -15,7 +15,7 @@ from frit.solver.geometry import Mesh
 from frit.solver.integrators import Integrator
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
-from frit.solver.run import Ending, Event, RunError, check, events, run
+from frit.solver.run import PRESSED, Ending, Event, RunError, check, events, piled_up, run
 from frit.solver.scheme import Scheme
 from frit.solver.state import State
 
@@ -208,7 +208,7 @@ def test_a_step_far_too_long_ends_with_time_place_and_cause(ranks: Ranks, rigid:
 @pytest.mark.parametrize("column", [0, 1, 2])
 def test_a_single_bad_value_is_found(ranks: Ranks, value: float, column: int) -> None:
     _, scheme, state = start(discs(), ranks)
-    node = int(scheme.active.nodes[41])
+    node = int(np.flatnonzero(~scheme.d.at_wall)[41])
     state.u[node, column] = value
     with pytest.raises(RunError, match=f"node {node} at "):
         check(scheme, state)
@@ -217,5 +217,63 @@ def test_a_single_bad_value_is_found(ranks: Ranks, value: float, column: int) ->
 def test_values_at_the_limits_pass(ranks: Ranks) -> None:
     _, scheme, state = start(discs(), ranks)
     check(scheme, state)
-    state.u[3, 0], state.u[4, 0], state.u[5, 1] = 1.5, -0.5, 1.5
+    inside, wall = np.flatnonzero(~scheme.d.at_wall), np.flatnonzero(scheme.d.at_wall)
+    state.u[inside[:2], 0], state.u[inside[2], 1] = (1.5, -0.5), 1.5
+    state.u[wall[:2], 0], state.u[wall[2], 1] = (3.0, -0.5), 1.5
     check(scheme, state)
+
+
+@pytest.mark.parametrize(("column", "value"), [(0, 3.0001), (0, -0.5001), (0, float("nan")), (1, 1.5001)])
+def test_there_are_limits_at_walls_too(ranks: Ranks, column: int, value: float) -> None:
+    _, scheme, state = start(discs(), ranks)
+    node = int(np.flatnonzero(scheme.d.at_wall)[7])
+    state.u[node, column] = value
+    words = rf"node {node} at .* left \[-0\.5, 1\.5\] \(rho at a wall: 3\); likely cause: {PRESSED}, or {CAUSE}"
+    with pytest.raises(RunError, match=words):
+        check(scheme, state)
+
+
+def test_walls_are_the_nodes_within_a_spacing(ranks: Ranks) -> None:
+    mesh, scheme, _ = start(discs(), ranks)
+    x, y = mesh.nodes.T
+    near = np.minimum.reduce([x, 17.0 - x, y, 10.0 - y]) <= mesh.spacing.max()
+    np.testing.assert_array_equal(scheme.d.at_wall, near)
+    assert near[np.minimum.reduce([x, 17.0 - x, y, 10.0 - y]) < 1e-9].all()
+    assert 0 < near.sum() < len(near) / 2
+
+
+class Pressed(Log):
+    """Writes down the largest rho, and what is said of it, at history times."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.most: list[float] = []
+        self.said: list[str | None] = []
+
+    def history(self, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+        self.most.append(float(state.u[:, 0].max()))
+        self.said.append(piled_up(scheme, state))
+
+
+def test_a_particle_pressed_against_a_wall_is_no_failure(ranks: Ranks) -> None:
+    """A contact whose rho exceeds rho_0 drives its particles apart, here into the walls; there rho rises and falls."""
+    case = parse_case({
+        "domain": {"size": [16.0, 10.0]},
+        "nodes": {"spacing": 1.0},
+        "particles": {"centres": [[4.0, 5.0], [12.0, 5.0]], "radii": [4.0, 4.0]},
+        "model": {"rho_0": 0.5},
+        "time": {"end": 1.2},
+        "output": {"history_every": 0.05},
+    })  # fmt: skip
+    mesh, scheme, state = start(case, ranks)
+    mass = scheme.d.mass @ state.rho
+    log = Pressed()
+    assert run(scheme, state, make_integrator(case, mesh), log) is Ending.DONE
+    most = np.array(log.most)
+    assert 1.5 < most.max() < 3.0
+    assert most[0] < 1.0
+    assert most[-1] < most.max() - 0.05
+    assert [text is not None for text in log.said] == (most > 1.5).tolist()
+    texts = [text for text in log.said if text]
+    assert all(re.fullmatch(rf"at t = .* at \((0\.000|16\.000), .*\) nm: rho = .*: {PRESSED}", text) for text in texts)
+    assert scheme.d.mass @ state.rho == pytest.approx(mass, rel=1e-12)

@@ -67,9 +67,11 @@ def activate(d: Discretisation, state: State) -> Active:
     exists (`LEAST`), and slots are moved where particles that shared one have come close. Collective; the result does
     not depend on the number of ranks.
     """
-    flags, owner = _settle(d, state)
+    flags, owner, pairs = _settle(d, state)
     if not _worth(d, flags):
         flags[:] = 1
+    else:
+        pairs = None  # of all points: too many
     table = d.shape
     low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
     high = np.full(d.nodes, -1, dtype=np.int64)
@@ -105,7 +107,7 @@ def activate(d: Discretisation, state: State) -> Active:
         shared=d.share.halo.shared[moving[d.share.halo.shared]],
         inner=np.setdiff1d(np.flatnonzero(moving), d.share.halo.shared, assume_unique=True),
         owned=d.share.owned[moving[d.share.owned]],
-        pairs=_everyones_pairs(d, slots.meeting(owner, live)),
+        pairs=_everyones_pairs(d, slots.meeting(owner, live)) if pairs is None else pairs,
         potential=potential,
         edge_nodes=edge_nodes,
         edge_particle=high[edge_nodes].astype(np.int32),
@@ -123,14 +125,15 @@ def _worth(d: Discretisation, flags: Numbers) -> bool:
     return bool(counts[0] <= WORTH * counts[1])
 
 
-def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
-    """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks.
+def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers | None]:
+    """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks; and
+    the pairs of particles that meet at any point of any rank, where somebody asked.
 
     Particles that clash move to other slots until none does. What has been seen to meet stays known, so this ends.
     Where the particles then need fewer packs of slots than there are, all are dealt out anew.
     """
     known = np.empty((0, 2), dtype=np.int64)
-    compact, points = True, d.shape.points
+    compact, points, meet = True, d.shape.points, None
     flags = np.zeros(points, dtype=np.int32)
     owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
     clash = np.full((points, 2), -1, dtype=np.int64)
@@ -141,10 +144,14 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
             flags[:] = 1
         if not d.case.activation.few_order_parameters:
             owner[:] = np.arange(owner.shape[1], dtype=np.int32)
-            return flags, owner
+            return flags, owner, None
         claims, clashes = _claim(d, owner, clash)
         clashes = _everyones_pairs(d, clashes)
-        fewer = compact and _fits_fewer(d, owner, state)
+        if compact and state.u.shape[1] > LANES:
+            meet = _everyones_pairs(d, slots.meeting(owner, np.arange(points)))
+            fewer = width(int(slots.colour(meet, len(state.slot_of)).max()) + 1) < state.u.shape[1]
+        else:
+            meet, fewer = None, False
         if len(clashes) or fewer:
             every = np.arange(d.nodes)
             seen = [known, clashes, slots.meeting(claims, every), slots.meeting(state.owner, every)]
@@ -161,7 +168,7 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
         if not len(clashes) and columns >= state.u.shape[1]:
             state.owner = claims
             state.eta[claims < 0] = 0.0
-            return flags, owner
+            return flags, owner, meet
         before, state.slot_of = state.owner, slot_of
         state.u, state.owner = slots.repack(state.u, state.owner, slot_of, columns)
         if state.owner.shape == before.shape:
@@ -169,14 +176,6 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers]:
         else:
             changed = np.ones(d.nodes, dtype=bool)
             owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
-
-
-def _fits_fewer(d: Discretisation, owner: Numbers, state: State) -> bool:
-    """Whether the particles that meet at points, and perhaps all that need slots of their own, fit into fewer packs."""
-    if state.u.shape[1] == LANES:
-        return False
-    meet = _everyones_pairs(d, slots.meeting(owner, np.arange(d.shape.points)))
-    return bool(width(int(slots.colour(meet, len(state.slot_of)).max()) + 1) < state.u.shape[1])
 
 
 def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:

@@ -134,7 +134,7 @@ def scatter_two(
 @jit
 def potential(
     W: Floats, touching: Integers, fields: Floats, D: Floats, squares: Floats, columns: Floats,
-    blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, mask: Floats, partial: Flags,
+    blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, owner: Numbers, partial: Flags,
     begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats, m: Coefficients,
     low: int, high: int, touches: int,
 ) -> int:
@@ -145,7 +145,7 @@ def potential(
     """
     mode = flush_denormals()
     width = table.shape[0]
-    overlaps = np.empty((1, LANES))
+    there, overlaps = np.empty((1, LANES)), np.empty((1, LANES))
     flow = np.empty((4, LANES))
     for l in range(low, high):
         b = blocks[l]
@@ -168,7 +168,9 @@ def potential(
         for e in range(first[l] + 1, end):
             eta = load(fields, e * width, 0)
             if partial[e]:
-                exists = load(mask, e, 0)
+                for j in range(LANES):
+                    there[0, j] = 1.0 if owner[e, j] >= 0 else 0.0
+                exists = load(there, 0, 0)
                 eta = exists * eta
                 store(fields, e * width, 0, eta)
                 for k in range(1, width):

@@ -47,7 +47,6 @@ class LiveBlocks:
     column: Numbers  # (E,) column of u
     particle: Numbers  # (E,) the particle of all lanes; -1: rho, MIXED: see owner
     owner: Numbers  # (E, LANES) the particle in each lane, -1: it does not exist there
-    mask: Floats  # (E, LANES) 1 where it exists, else 0
     partial: Flags  # (E,) whether it is missing in a lane
 
 
@@ -131,11 +130,10 @@ def live_blocks(blocks: Blocks, flags: Numbers, owner: Numbers, weights: Floats)
         np.zeros(entries, dtype=np.int32),
         np.full(entries, -1, dtype=np.int32),
         np.full((entries, LANES), -1, dtype=np.int32),
-        np.ones((entries, LANES)),
         np.zeros(entries, dtype=bool),
     )
     fill_entries(
-        live.weights, live.column, live.particle, live.owner, live.mask, live.partial,
+        live.weights, live.column, live.particle, live.owner, live.partial,
         first, slots, chosen, blocks.points, flags, owner, weights,
     )
     return live
@@ -160,7 +158,7 @@ def count_entries(
 
 @jit
 def fill_entries(
-    weights: Floats, column: Numbers, particle: Numbers, entry_owner: Numbers, mask: Floats, partial: Flags,
+    weights: Floats, column: Numbers, particle: Numbers, entry_owner: Numbers, partial: Flags,
     first: Integers, slots: Bytes, chosen: Integers, points: Numbers, flags: Numbers, owner: Numbers, w: Floats,
 ) -> None:
     """Fill the arrays of `LiveBlocks`; rho's entries stand at their defaults."""
@@ -179,7 +177,6 @@ def fill_entries(
                 a = owner[p, s] if p >= 0 and flags[p] else np.int32(-1)
                 entry_owner[e, j] = a
                 if a < 0:
-                    mask[e, j] = 0.0
                     partial[e] = True
                 elif particle[e] == -1:
                     particle[e] = a

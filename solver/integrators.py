@@ -122,7 +122,7 @@ class Chebyshev:
         self.age = kept.get("age", 0.0)
         self.error_before = kept.get("error_before", 0.0)
         self.dt_before = kept.get("dt_before", 0.0)
-        self.work: list[Floats] = []
+        self.work: list[Floats] = []  # of fields; at nodes that stand still they and state.u are the same
         self.old = self.rate_0 = self.rate_1 = np.empty((0, 0))
         self.fresh = False  # whether rate_1 is F(state.u)
         self.start = 0.0
@@ -138,10 +138,11 @@ class Chebyshev:
     def restart(self, scheme: Scheme, state: State) -> None:
         """Fit the work arrays to the state and forget the last rate."""
         if self.old.shape != state.u.shape:
-            self.work = [np.zeros_like(state.u) for _ in range(4)]
+            self.work = [np.zeros_like(state.u) for _ in range(2)]
             self.old, self.rate_0, self.rate_1 = (np.zeros_like(state.u) for _ in range(3))
         for array in self.work:
             array[:] = state.u
+        self.rate_0[:] = self.rate_1[:] = 0.0
         self.fresh = False
 
     def step(self, scheme: Scheme, state: State, limit: float) -> None:
@@ -194,7 +195,8 @@ class Chebyshev:
         """Fill state.u with the new fields and rate_1 with their rate; the error in units of the tolerance."""
         nodes = scheme.active.nodes
         stages = max(2, 1 + int(sqrt(1.0 + 1.54 * dt * self.radius)))
-        before, last, new, rate = self.work
+        before, last = self.work
+        new, rate = state.u, self.rate_1  # what is in them is needed no more
         kernels.start(before, self.old, nodes)
         for j, c in enumerate(coefficients(stages, dt), start=1):
             if j == 1:
@@ -203,7 +205,7 @@ class Chebyshev:
             scheme.rates(last, rate)
             kernels.chebyshev_stage(new, self.old, before, last, rate, self.rate_0, c, nodes)
             before, last, new = last, new, before
-        kernels.start(state.u, last, nodes)
+        state.u, self.work = last, [before, new]
         self.tau = max(self.least_tau, THETA * dt)
         scheme.rates(state.u, self.rate_1, self.tau)
         state.evaluations += stages
@@ -233,7 +235,7 @@ class Chebyshev:
         It starts from the rate with signs that change from node to node: the stiffest modes are among the shortest.
         """
         nodes, ranks = scheme.active.nodes, scheme.d.share.ranks
-        moved, direction, _, rate = self.work
+        (moved, direction), rate = self.work, self.rate_1
         size = sqrt(_total(ranks, kernels.squares(self.old, scheme.active.owned)))
         length = sqrt(_total(ranks, kernels.squares(self.rate_0, scheme.active.owned)))
         if length == 0.0:
@@ -241,7 +243,7 @@ class Chebyshev:
             return
         delta = 1e-7 * max(size, 1.0)
         kernels.start(direction, self.rate_0, nodes)
-        direction[scheme.d.share.nodes * 2654435761 % 2**32 >= 2**31] *= -1.0
+        direction[nodes[scheme.d.share.nodes[nodes] * 2654435761 % 2**32 >= 2**31]] *= -1.0
         radius = 0.0
         for _ in range(50):
             kernels.advance(moved, self.old, delta / length, direction, nodes)

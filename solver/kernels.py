@@ -750,13 +750,18 @@ def clear(array: Floats, listed: Integers) -> None:
 
 
 @jit
-def scale(array: Floats, factors: Floats, listed: Integers) -> None:
-    """array[a, :] *= factors[a, :] at the listed nodes."""
+def divide_rates(rate: Floats, mass: Floats, owner: Numbers, listed: Integers) -> None:
+    """rate[a, :] /= m_a at the listed nodes; 0 in slots that no particle has there."""
     mode = flush_denormals()
+    slots = owner.shape[1]
     for i in range(listed.size):
         a = listed[i]
-        for column in range(0, array.shape[1], LANES):
-            store(array, a, column, load(factors, a, column) * load(array, a, column))
+        factor = 1.0 / mass[a]
+        rate[a, 0] *= factor
+        for s in range(slots):
+            rate[a, 1 + s] *= factor if owner[a, s] >= 0 else 0.0
+        for column in range(1 + slots, rate.shape[1]):
+            rate[a, column] = 0.0
     restore_denormals(mode)
 
 

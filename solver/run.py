@@ -183,8 +183,9 @@ def describe(scheme: Scheme, state: State, node: int) -> str:
     cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
     if scheme.d.case.model.rigid_motion:
         cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
-    limits = f"[{LOWEST:g}, {HIGHEST:g}]"
-    if scheme.d.at_wall[node]:
-        limits += f" (rho at a wall: {HIGHEST_AT_WALL:g})"
-        cause = f"{PRESSED}, or {cause}" if scheme.d.case.model.rigid_motion else cause
-    return f"{fields_at(scheme, state, node)} left {limits}; likely cause: {cause}"
+    highest = HIGHEST
+    if scheme.d.at_wall[node] and state.u[node, 0] > HIGHEST_AT_WALL:
+        highest = HIGHEST_AT_WALL
+        if scheme.d.case.model.rigid_motion:
+            cause = f"{PRESSED}, or {cause}"
+    return f"{fields_at(scheme, state, node)} left [{LOWEST:g}, {highest:g}]; likely cause: {cause}"

@@ -35,16 +35,14 @@ class Scheme:
         with self.d.share.ranks.watch("live points"):
             # What is chosen from; a resumed run chooses from it again, and comes to the same.
             self.before = replace(state, u=state.u.copy(), owner=state.owner.copy(), slot_of=state.slot_of.copy())
+            if hasattr(self, "active"):
+                del self.active  # hundreds of bytes per point, in the way of the next
             self._activate(state)
 
     def _activate(self, state: State) -> None:
         self.active: Active = activate(self.d, state)
         d, a, columns = self.d, self.active, state.u.shape[1]
         self.slot_of, self.node_owner = state.slot_of, state.owner
-        self.inverse_mass = np.zeros_like(state.u)  # 1 / m_a; 0 in slots that no particle has at the node
-        self.inverse_mass[:, 0] = 1.0
-        self.inverse_mass[:, 1 : 1 + state.owner.shape[1]] = state.owner >= 0
-        self.inverse_mass /= d.mass[:, None]
 
         # Nodes: W, and fields and rates by columns for the points in blocks; see `block_kernels`
         self.u_columns, self.rate_columns = np.zeros((2, columns, d.nodes + LANES))
@@ -104,7 +102,7 @@ class Scheme:
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
         watch.enter("scatter")
         self._scatter(rate)
-        kernels.scale(rate, self.inverse_mass, a.nodes)
+        kernels.divide_rates(rate, d.mass, self.node_owner, a.nodes)
         watch.enter(before)
 
     def imbalance(self) -> float:
@@ -147,7 +145,7 @@ class Scheme:
         if blocks[0] < blocks[1]:
             self.touches = block_kernels.potential(
                 self.W_row, self.touching, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
-                a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.mask, a.blocks.partial,
+                a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.owner, a.blocks.partial,
                 d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table, d.coefficients,
                 *blocks, self.touches,
             )

@@ -228,8 +228,8 @@ def test_there_are_limits_at_walls_too(ranks: Ranks, column: int, value: float) 
     _, scheme, state = start(discs(), ranks)
     node = int(np.flatnonzero(scheme.d.at_wall)[7])
     state.u[node, column] = value
-    words = rf"node {node} at .* left \[-0\.5, 1\.5\] \(rho at a wall: 3\); likely cause: {PRESSED}, or {CAUSE}"
-    with pytest.raises(RunError, match=words):
+    limits = rf"\[-0\.5, 3\]; likely cause: {PRESSED}, or" if value > 3.0 else r"\[-0\.5, 1\.5\]; likely cause:"
+    with pytest.raises(RunError, match=rf"node {node} at .* left {limits} {CAUSE}"):
         check(scheme, state)
 
 
@@ -271,7 +271,7 @@ def test_a_particle_pressed_against_a_wall_is_no_failure(ranks: Ranks) -> None:
     assert run(scheme, state, make_integrator(case, mesh), log) is Ending.DONE
     most = np.array(log.most)
     assert 1.5 < most.max() < 3.0
-    assert most[0] < 1.0
+    assert most[0] <= 1.0
     assert most[-1] < most.max() - 0.05
     assert [text is not None for text in log.said] == (most > 1.5).tolist()
     texts = [text for text in log.said if text]

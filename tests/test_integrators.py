@@ -367,6 +367,26 @@ def test_values_between_steps_are_as_good_as_the_steps() -> None:
             np.testing.assert_array_equal(got[8:], VALUES[8:])
 
 
+def test_nodes_that_stand_still_keep_their_values_whatever_the_stages() -> None:
+    """u' = -500 u beside u' = -u: steps of few stages and of many, the spectral radius estimated once in 25 of them."""
+    factors = np.where(np.arange(40) % 2, 1.0, 500.0)[:, None]
+    problem, state = start(lambda u: -factors * u, np.linspace(0.2, 2.0, 40))
+    problem.active.nodes = problem.active.owned = np.arange(0, 40, 3)
+    still = np.setdiff1d(np.arange(40), problem.active.nodes)
+    before = state.u.copy()
+    integrator = Chebyshev(1e-5, 0.0)
+    integrator.restart(problem, state)
+    stages = set()
+    while state.time < 4.0:
+        done = state.evaluations
+        integrator.step(problem, state, 4.0)
+        stages.add(state.evaluations - done)
+        for fields in (state.u, integrator.at(problem, state, state.time)):
+            np.testing.assert_array_equal(fields[still], before[still])
+    assert state.step > 50
+    assert len(stages) > 3
+
+
 def test_steps_allocate_nothing_that_grows_with_the_mesh(ranks: Ranks) -> None:
     """Once its arrays are there, a step takes less new memory than one value per node: lists, views, the few numbers of
     each particle and its contacts."""

@@ -11,8 +11,8 @@ import numpy as np
 from .arrays import Flags, Floats, Integers, Numbers
 from .energy import Coefficients, df_deta, df_drho, mobility
 from .jit import inlined, jit
-from .kernels import touching_share, x_velocity, y_velocity, z_velocity
-from .simd import LANES, flush_denormals, load, positive, restore_denormals, splat, store
+from .kernels import FAR, touching_share, x_velocity, y_velocity, z_velocity
+from .simd import LANES, flush_denormals, load, positive, restore_denormals, splat, store, transpose
 
 NOBODY = 1e9  # more than any number of a particle: those of several are compared as floats, eight at a time
 
@@ -215,7 +215,7 @@ def meet(
             if owner[e, j] < 0 or fields[e * width, j] <= 0.0:
                 continue
             for g in range(e + 1, first[l + 1]):
-                if owner[g, j] < 0 or fields[g * width, j] <= 0.0:
+                if owner[g, j] < 0 or fields[e * width, j] * fields[g * width, j] <= FAR * c:
                     continue
                 r = min(count, share.size - 1)
                 a, b = (e, g) if owner[e, j] < owner[g, j] else (g, e)
@@ -464,19 +464,36 @@ def by_column(high: Floats, low: Floats, node_owner: Numbers) -> None:
 
 @jit
 def to_columns(columns: Floats, u: Floats, listed: Integers) -> None:
-    """columns[c, a] = u[a, c] at the listed nodes."""
+    """columns[c, a] = u[a, c] at the listed nodes, eight at a time where they follow one another."""
     for c in range(0, u.shape[1], LANES):
-        for i in range(listed.size):
+        i = 0
+        while i < listed.size:
             a = listed[i]
-            for k in range(LANES):
-                columns[c + k, a] = u[a, c + k]
+            if i + LANES <= listed.size and listed[i + LANES - 1] == a + LANES - 1:
+                transpose(u, a, c, columns, c, a)
+                i += LANES
+            else:
+                for k in range(LANES):
+                    columns[c + k, a] = u[a, c + k]
+                i += 1
 
 
 @jit
 def add_columns(u: Floats, columns: Floats, listed: Integers) -> None:
-    """u[a, c] += columns[c, a] at the listed nodes."""
+    """u[a, c] += columns[c, a], and columns[c, a] = 0, at the listed nodes."""
+    square = np.empty((LANES, LANES))
     for c in range(0, u.shape[1], LANES):
-        for i in range(listed.size):
+        i = 0
+        while i < listed.size:
             a = listed[i]
-            for k in range(LANES):
-                u[a, c + k] += columns[c + k, a]
+            if i + LANES <= listed.size and listed[i + LANES - 1] == a + LANES - 1:
+                transpose(columns, c, a, square, 0, 0)
+                for k in range(LANES):
+                    store(columns, c + k, a, splat(0.0))
+                    store(u, a + k, c, load(u, a + k, c) + load(square, k, 0))
+                i += LANES
+            else:
+                for k in range(LANES):
+                    u[a, c + k] += columns[c + k, a]
+                    columns[c + k, a] = 0.0
+                i += 1

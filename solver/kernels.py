@@ -28,6 +28,8 @@ from .simd import (
     with_first,
 )
 
+FAR = 0.5  # of c: no cell counts as so large that the level c reaches it where eta_a eta_b is this far from c
+
 
 @inlined
 def gather(
@@ -187,14 +189,14 @@ def touching_share(contacts: Floats, r: int, w: float, dim: int, c: float) -> fl
     a = 1 + dim
     b = 2 + 2 * dim
     product = contacts[r, a] * contacts[r, b]
-    if abs(product - c) >= 0.5 * c:  # no cell counts as larger than that
+    if abs(product - c) >= (1.0 - FAR) * c:
         return 1.0 if product > c else 0.0
     square = 0.0
     for k in range(1, 1 + dim):
         slope = contacts[r, a] * contacts[r, b + k] + contacts[r, b] * contacts[r, a + k]
         square += slope * slope
     radius = np.sqrt(w / np.pi) if dim == 2 else np.cbrt(0.75 * w / np.pi)
-    reach = min(radius * np.sqrt(square), 0.5 * c)
+    reach = min(radius * np.sqrt(square), (1.0 - FAR) * c)
     if abs(product - c) >= reach:
         return 1.0 if product > c else 0.0
     d = (product - c) / reach
@@ -220,7 +222,7 @@ def meet(
             if owner[l, s] < 0 or point[row, 1 + s] <= 0.0:
                 continue
             for t in range(s + 1, owner.shape[1]):
-                if owner[l, t] < 0 or point[row, 1 + t] <= 0.0:
+                if owner[l, t] < 0 or point[row, 1 + s] * point[row, 1 + t] <= FAR * c:
                     continue
                 r = min(count, share.size - 1)
                 first_column, second_column = (1 + s, 1 + t) if owner[l, s] < owner[l, t] else (1 + t, 1 + s)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, eye_array
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from .arrays import Floats, Integers
@@ -80,19 +80,34 @@ class Relaxation:
         return self.carried + self.solve((free - self.carried).ravel()).reshape(free.shape)
 
 
+class Pattern:
+    """Where the entries of I + tau M S lie in a sparse matrix by columns, for the pairs (pairs, 2) that may touch."""
+
+    def __init__(self, pairs: Integers, particles: int, size: int) -> None:
+        """size: degrees of freedom of a particle."""
+        a, b = pairs[:, 0], pairs[:, 1]
+        self.block_rows, block_columns = np.concatenate([a, a, b, b]), np.concatenate([a, b, a, b])
+        self.count = count = particles * size
+        each, diagonal = np.arange(size), np.arange(count)
+        rows = self.block_rows[:, None, None] * size + each[:, None]
+        columns = block_columns[:, None, None] * size + each
+        codes = np.concatenate([(columns * count + rows).ravel(), diagonal * (count + 1)])
+        found, self.place = np.unique(codes, return_inverse=True)  # of each value in the matrix; the diagonal last
+        self.indices = (found % count).astype(np.int32)
+        self.starts = np.searchsorted(found, np.arange(count + 1) * count).astype(np.int32)
+
+    def matrix(self, blocks: Floats) -> csc_array:
+        """I + the blocks (4 pairs, size, size) of the pairs' rows and columns (a, a), (a, b), (b, a), (b, b)."""
+        values = np.concatenate([blocks.ravel(), np.ones(self.count)])
+        return csc_array((np.bincount(self.place, values), self.indices, self.starts), shape=(self.count, self.count))
+
+
 def relaxation(
-    stiffness: Floats, pairs: Integers, moments: Floats, m: Coefficients, tau: float, carried: Floats
+    stiffness: Floats, pattern: Pattern, moments: Floats, m: Coefficients, tau: float, carried: Floats
 ) -> Relaxation:
     """The relaxation for a stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over ranks."""
     particles, size = len(moments), stiffness.shape[2]
     units = np.broadcast_to(np.eye(size)[:, None, :], (size, particles, size))
     M = np.stack([velocities(unit, moments, m) for unit in units], axis=2)
-    a, b = pairs[:, 0], pairs[:, 1]
-    block_rows, block_columns = np.concatenate([a, a, b, b]), np.concatenate([a, b, a, b])
     S = np.concatenate([stiffness[:, 0], stiffness[:, 1], -stiffness[:, 0], -stiffness[:, 1]])
-    values = tau * np.einsum("pij,pjk->pik", M[block_rows], S)
-    rows = (block_rows[:, None, None] * size + np.arange(size)[None, :, None]) + np.zeros((1, 1, size), dtype=int)
-    columns = (block_columns[:, None, None] * size + np.arange(size)[None, None, :]) + np.zeros((1, size, 1), dtype=int)
-    count = particles * size
-    system = eye_array(count) + coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(count, count))
-    return Relaxation(carried, splu(system.tocsc()).solve)
+    return Relaxation(carried, splu(pattern.matrix(tau * (M[pattern.block_rows] @ S))).solve)

@@ -44,7 +44,7 @@ class Scheme:
         d, a, columns = self.d, self.active, state.u.shape[1]
         self.slot_of, self.node_owner = state.slot_of, state.owner
 
-        # Nodes: W, and fields and rates by columns for the points in blocks; see `block_kernels`
+        # Nodes: W; fields, and rates (0 between evaluations), by columns for the points in blocks: `block_kernels`
         self.u_columns, self.rate_columns = np.zeros((2, columns, d.nodes + LANES))
         self.W_row = np.zeros((1, d.nodes + LANES))
         self.W = self.W_row[0, : d.nodes]
@@ -62,6 +62,7 @@ class Scheme:
         size = self.motion.shape[1]
         self.sums = np.zeros((self.particles, size + 1 + d.dim))
         self.forces, self.moments = self.sums[:, :size], self.sums[:, size:]
+        self.pattern = rigid.Pattern(a.pairs, self.particles, size)
         self.carried = self.motion
 
     def _room(self, name: str, rows: int, columns: int) -> Floats:
@@ -94,7 +95,7 @@ class Scheme:
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
                 self.carried = self.motion
-                self.relax = rigid.relaxation(self._stiffness(), a.pairs, moments, m, tau, self.carried)
+                self.relax = rigid.relaxation(self._stiffness(), self.pattern, moments, m, tau, self.carried)
             self.motion = self.relax(free)
 
         # Fluxes (20), (21)
@@ -154,7 +155,6 @@ class Scheme:
         """Sources and fluxes of all points in rate, times m_a, after `_gather` and once the motion is known."""
         d, a = self.d, self.active
         kernels.clear(rate, a.nodes)
-        self.rate_columns[:] = 0.0
         if d.case.model.rigid_motion:
             kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
         motion = rigid.in_space(self.motion)

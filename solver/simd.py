@@ -3,8 +3,8 @@
 numba has no vector type, and its optimiser does not find the one that frit's layout is made for: rho and seven order
 parameters of a node are eight neighbouring doubles. A pack maps to LLVM's `<8 x double>`: one AVX-512 register, or two
 AVX2 registers on older processors. Inside `@jit` functions `load`, `store` and `splat` move packs, + - * work on them
-and with floats, so that a formula written for a float also serves a pack, and `total`, `first`, `with_first` and
-`positive` do what their names say.
+and with floats, so that a formula written for a float also serves a pack, and `total`, `first`, `with_first`,
+`positive` and `transpose` do what their names say.
 
 Far from all particles fields fall below 1e-308, where processors calculate a hundred times slower: between
 `flush_denormals` and `restore_denormals` such numbers are 0.
@@ -147,6 +147,42 @@ def _positive(typing: Any, value: Any) -> Any:
     return value(value), generate
 
 
+@intrinsic
+def _transpose(
+    typing: Any, array: Any, row: Any, column: Any, target: Any, target_row: Any, target_column: Any
+) -> Any:
+    """transpose(array, row, column, target, target_row, target_column): target's square of LANES rows and columns
+    that begins there becomes array's, rows and columns exchanged; no bounds are checked."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, row, column, target, target_row, target_column = arguments
+        kind, target_kind = signature.args[0], signature.args[3]
+        packs = []
+        for lane in range(LANES):
+            line = builder.add(row, ir.Constant(row.type, lane))
+            packs.append(builder.load(_address(context, builder, kind, array, line, column)))
+            packs[-1].align = 8
+        chosen = ir.VectorType(ir.IntType(32), LANES)
+        distance = 1
+        while distance < LANES:  # squares of 2 x 2 exchange two corners, then those of 4 x 4, then the whole
+            low = [j + (LANES - distance if j & distance else 0) for j in range(LANES)]
+            high = [j + LANES if j & distance else j + distance for j in range(LANES)]
+            for lane in range(LANES):
+                if not lane & distance:
+                    pair = packs[lane], packs[lane + distance]
+                    packs[lane] = builder.shuffle_vector(*pair, ir.Constant(chosen, low))
+                    packs[lane + distance] = builder.shuffle_vector(*pair, ir.Constant(chosen, high))
+            distance *= 2
+        for lane in range(LANES):
+            line = builder.add(target_row, ir.Constant(target_row.type, lane))
+            address = _address(context, builder, target_kind, target, line, target_column)
+            builder.store(packs[lane], address).align = 8
+        return context.get_dummy_value()
+
+    place = types.intp
+    return types.void(array, place, place, target, place, place), generate
+
+
 FLUSH = 0x8040  # bits of MXCSR: results below the normal range become 0, and such operands count as 0
 X86 = platform.machine() in ("x86_64", "AMD64")
 
@@ -211,6 +247,7 @@ with_first = cast(Callable[[Pack, float], Pack], _with_first)
 total = cast(Callable[[Pack], float], _total)
 Scalar = TypeVar("Scalar", float, Pack)
 positive = cast(Callable[[Scalar], Scalar], _positive)
+transpose = cast(Callable[[Floats, int, int, Floats, int, int], None], _transpose)
 flush_denormals = cast(Callable[[], int], _flush_denormals)
 restore_denormals = cast(Callable[[int], None], _restore_denormals)
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frit.solver import blocks, kernels
+from frit.solver import block_kernels, blocks, kernels
 from frit.solver.arrays import Floats
 from frit.solver.blocks import MIXED, Blocks, find_blocks
 from frit.solver.case import Case, parse_case
@@ -177,6 +177,28 @@ def test_what_is_too_small_becomes_zero_in_kernels_and_nowhere_else() -> None:
     assert (array[1] == normal).all()
     with np.errstate(under="ignore"):
         assert np.array([tiny])[0] * 0.5 == 5e-311  # numpy, and Python, go on as before
+
+
+@pytest.mark.parametrize("columns", [8, 24])
+def test_fields_by_columns_are_those_by_nodes_at_listed_nodes_only(columns: int) -> None:
+    """Runs of nodes of every length: eight at a time where that many follow one another, singly elsewhere."""
+    rng = np.random.default_rng(3)
+    u, before = rng.standard_normal((2, 200, columns))
+    gone = np.cumsum(np.arange(1, 19))  # between them runs of 1, 2, ... 17 nodes
+    listed = np.setdiff1d(np.arange(200), gone)
+    by_columns = np.full((columns, 200 + LANES), 7.0)
+    block_kernels.to_columns(by_columns, u, listed)
+    np.testing.assert_array_equal(by_columns[:, listed], u[listed].T)
+    by_columns[:, listed] = 7.0
+    assert (by_columns == 7.0).all()
+    block_kernels.to_columns(by_columns, u, listed)
+    sums = before.copy()
+    block_kernels.add_columns(sums, by_columns, listed)
+    np.testing.assert_array_equal(sums[listed], before[listed] + u[listed])
+    np.testing.assert_array_equal(sums[gone[gone < 200]], before[gone[gone < 200]])
+    assert not by_columns[:, listed].any()
+    by_columns[:, listed] = 7.0
+    assert (by_columns == 7.0).all()
 
 
 # --- what a rank has to do

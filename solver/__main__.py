@@ -300,8 +300,7 @@ def record_end(
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     record |= {"state": state, "message": message, "retry": retry, "end": output.now(), "profile": list(profile)}
     output.write_json(path, record)
-    with open(directory / "log.txt", "a") as log:
-        log.write(f"{output.now()} {state}{': ' + message if message else ''}\n")
+    add_to_log(directory, f"{state}{': ' + message if message else ''}")
     if message:
         print(f"{state}: {message}", file=sys.stderr, flush=True)
 
@@ -311,8 +310,13 @@ def record_note(directory: Path, note: str) -> None:
     path = directory / "run.json"
     record: dict[str, Any] = json.loads(path.read_text())
     output.write_json(path, record | {"notes": [*record["notes"], note]})
+    add_to_log(directory, f"note: {note}")
+
+
+def add_to_log(directory: Path, line: str) -> None:
+    """A line of log.txt, with the time."""
     with open(directory / "log.txt", "a") as log:
-        log.write(f"{output.now()} note: {note}\n")
+        log.write(f"{output.now()} {line}\n")
 
 
 def versions() -> dict[str, str]:

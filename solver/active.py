@@ -68,10 +68,10 @@ def activate(d: Discretisation, state: State) -> Active:
     not depend on the number of ranks.
     """
     flags, owner, pairs = _settle(d, state)
-    if not _worth(d, flags):
-        flags[:] = 1
+    if _worth(d, flags):
+        pairs = None  # those at live points alone are wanted
     else:
-        pairs = None  # of all points: too many
+        flags[:] = 1
     table = d.shape
     low = np.full(d.nodes, np.iinfo(np.int32).max, dtype=np.int64)
     high = np.full(d.nodes, -1, dtype=np.int64)
@@ -133,7 +133,7 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers
     Where the particles then need fewer packs of slots than there are, all are dealt out anew.
     """
     known = np.empty((0, 2), dtype=np.int64)
-    compact, points, meet = True, d.shape.points, None
+    compact, points = True, d.shape.points
     flags = np.zeros(points, dtype=np.int32)
     owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
     clash = np.full((points, 2), -1, dtype=np.int64)
@@ -147,11 +147,10 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers
             return flags, owner, None
         claims, clashes = _claim(d, owner, clash)
         clashes = _everyones_pairs(d, clashes)
+        meet, fewer = None, False
         if compact and state.u.shape[1] > LANES:
             meet = _everyones_pairs(d, slots.meeting(owner, np.arange(points)))
             fewer = width(int(slots.colour(meet, len(state.slot_of)).max()) + 1) < state.u.shape[1]
-        else:
-            meet, fewer = None, False
         if len(clashes) or fewer:
             every = np.arange(d.nodes)
             seen = [known, clashes, slots.meeting(claims, every), slots.meeting(state.owner, every)]

@@ -37,6 +37,16 @@ PAIR: Case = {
     "output": {"history_every": 0.001, "snapshots": [0.0, 0.0035, 0.01]},
 }
 
+# Two discs between two walls: rho exceeds this rho_0 in their contact, which drives them apart and into the walls.
+PRESSED: Case = {
+    "domain": {"size": [16.0, 10.0]},
+    "nodes": {"spacing": 1.0},
+    "particles": {"centres": [[4.0, 5.0], [12.0, 5.0]], "radii": [4.0, 4.0]},
+    "model": {"rho_0": 0.5},
+    "time": {"end": 0.3},
+    "output": {"history_every": 0.05},
+}
+
 # The solver waits for a signal after the given steps; see `held_at` and `until_held`.
 HELD = """
 import sys, time

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from launching import PAIR, TIMEOUT, different, history, interrupted, record
+from launching import PAIR, PRESSED, TIMEOUT, different, history, interrupted, record
 
 from frit.solver.profile import PHASES
 
@@ -93,12 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "wrong.toml").write_text(CASE.replace("radii = [5.0", "radii = [-5.0"))
     unstable = PAIR | {"time": {"integrator": "rk2", "end": 10.0, "step": 0.5}, "output": {"history_every": 0.5}}
     (folder / "unstable.json").write_text(json.dumps(unstable))
-    pressed = {
-        "name": "pressed", "domain": {"size": [16.0, 10.0]}, "nodes": {"spacing": 1.0}, "model": {"rho_0": 0.5},
-        "particles": {"centres": [[4.0, 5.0], [12.0, 5.0]], "radii": [4.0, 4.0]}, "time": {"end": 0.3},
-        "output": {"history_every": 0.05},
-    }  # fmt: skip
-    (folder / "pressed.json").write_text(json.dumps(pressed))
+    (folder / "pressed.json").write_text(json.dumps(PRESSED))
     status, out, err = frit(folder, "run", "pair.toml")
     assert (status, err) == (0, ""), out + err
     (folder / "said").write_text(out)

@@ -4,6 +4,7 @@ import math
 import re
 from typing import Any
 
+import launching
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -256,15 +257,8 @@ class Pressed(Log):
 
 
 def test_a_particle_pressed_against_a_wall_is_no_failure(ranks: Ranks) -> None:
-    """A contact whose rho exceeds rho_0 drives its particles apart, here into the walls; there rho rises and falls."""
-    case = parse_case({
-        "domain": {"size": [16.0, 10.0]},
-        "nodes": {"spacing": 1.0},
-        "particles": {"centres": [[4.0, 5.0], [12.0, 5.0]], "radii": [4.0, 4.0]},
-        "model": {"rho_0": 0.5},
-        "time": {"end": 1.2},
-        "output": {"history_every": 0.05},
-    })  # fmt: skip
+    """There rho rises and falls."""
+    case = parse_case(launching.PRESSED | {"time": {"end": 1.2}})
     mesh, scheme, state = start(case, ranks)
     mass = scheme.d.mass @ state.rho
     log = Pressed()

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import block_kernels, kernels, slots
+from . import block_kernels, kernels, slots, unknowns
 from .arrays import Array, Flags, Floats, Integers, Numbers
 from .blocks import LiveBlocks, live_blocks
 from .discretisation import FIXED_WORK, WORTH, Discretisation
 from .rigid import rotations
 from .simd import LANES
 from .state import State, width
+from .unknowns import Unknowns
 
 LEAST = 3.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
 SLOT_EPS = 0.3  # eps_eta: unit in which an order parameter's growth is measured where it does not exist yet
@@ -35,18 +36,15 @@ class Active:
     present: Flags  # (L, F / LANES) packs of columns that hold anything
     several: Flags  # (L,) points that see more than one particle
     nodes: Integers  # nodes that a live point of any rank touches: the only ones that change
-    shared: Integers  # those of them that other ranks hold, too
-    inner: Integers  # the others
-    owned: Integers  # those of them that this rank owns
+    unknowns: Unknowns  # the fields that exist there
     pairs: Integers  # (pairs, 2) particles a < b that a live point of any rank sees together
     potential: Floats  # (n,) what this rank's still points owe to W, times m_a
     edge_nodes: Integers  # nodes between live points and a particle's still interior
     edge_particle: Numbers  # that particle
     drift: Floats  # (edges, 2, dim + rotations) what still points owe to the advection there
     moments: Floats  # (particles, 1 + dim) int eta, int r eta over the owned nodes that stand still
-    reference: Floats  # (n, F) the fields when the set was made
-    watched: Integers  # nodes whose values decide whether the set still holds
-    watch: Integers  # (n,) which of their fields, see `kernels.watch_nodes`
+    reference: Floats  # (y,) the fields when the set was made
+    watch: Floats  # (y,) 1 / eps where their change decides whether the set still holds, else 0
 
     def work(self) -> float:
         """What an evaluation costs on this rank, in units of one field of one block.
@@ -56,10 +54,9 @@ class Active:
         blocks = FIXED_WORK * self.blocks.blocks.size + self.blocks.column.size
         return float(blocks + 2.0 * (FIXED_WORK * self.loose.size + self.present.sum()))
 
-    def stale(self, u: Floats, eps_rho: float, eps_eta: float) -> float:
+    def stale(self, u: Floats) -> float:
         """Largest movement of a watched value, in units of its eps; `run.LAG` says when it is too much."""
-        slot = SLOT_EPS * eps_eta
-        return float(kernels.largest_change(u, self.reference, self.watched, self.watch, eps_rho, eps_eta, slot))
+        return float(unknowns.largest_change(u, self.reference, self.watch, self.unknowns.strips))
 
 
 def activate(d: Discretisation, state: State) -> Active:
@@ -86,17 +83,17 @@ def activate(d: Discretisation, state: State) -> Active:
     moving, resting = _touched(d, flags != 0), _touched(d, flags == 0)
     edge_nodes = np.flatnonzero(moving & resting & (high >= 0))
     potential, drift = _still_shares(d, state, flags, owner, edge_nodes, high)
-    still = d.share.owned[~moving[d.share.owned]]
+    blocks = live_blocks(d.blocks, flags, owner, d.weights)
+    kind = np.where(d.share.halo.owned, unknowns.OWNED, 0)
+    kind[:] |= unknowns.BLOCKS if blocks.blocks.size else 0
+    kind[_seen_by(d, loose)] |= unknowns.LOOSE
+    kind[edge_nodes] |= unknowns.LOOSE
+    moved, rest = (unknowns.lay_out(np.flatnonzero(s), state.owner, kind, d.share.halo) for s in (moving, ~moving))
     moments = np.zeros((len(state.slot_of), 1 + d.dim))
-    kernels.add_moments(moments, state.u, still, state.owner, d.mass, d.first_moment)
-    watch = np.zeros(d.nodes, dtype=np.int64)
-    kernels.watch_nodes(
-        watch, flags, owner, state.owner, table.offsets, table.nodes, table.rows, table.table,
-        d.nearest.kind, d.nearest.starts, d.nearest.places,
-    )
+    unknowns.add_moments(moments, rest.take(state.u), d.mass, d.first_moment, rest.strips)
     return Active(
         live=live,
-        blocks=live_blocks(d.blocks, flags, owner, d.weights),
+        blocks=blocks,
         loose=loose,
         loose_border=int((flags[d.blocks.loose[: d.blocks.loose_border]] != 0).sum()),
         owner=owner[loose],
@@ -104,18 +101,15 @@ def activate(d: Discretisation, state: State) -> Active:
         present=(mask != 0.0).reshape(loose.size, mask.shape[1] // LANES, LANES).any(axis=2),
         several=mask.sum(axis=1) > 2.0,
         nodes=np.flatnonzero(moving),
-        shared=d.share.halo.shared[moving[d.share.halo.shared]],
-        inner=np.setdiff1d(np.flatnonzero(moving), d.share.halo.shared, assume_unique=True),
-        owned=d.share.owned[moving[d.share.owned]],
+        unknowns=moved,
         pairs=_everyones_pairs(d, slots.meeting(owner, live)) if pairs is None else pairs,
         potential=potential,
         edge_nodes=edge_nodes,
         edge_particle=high[edge_nodes].astype(np.int32),
         drift=drift,
         moments=moments,
-        reference=state.u.copy(),
-        watched=np.flatnonzero(moving & (watch != 0)),
-        watch=watch,
+        reference=moved.take(state.u),
+        watch=_watch(d, flags, owner, state.owner, moved),
     )
 
 
@@ -229,6 +223,27 @@ def _spread(d: Discretisation, low: Array, high: Array) -> None:
     np.negative(low, out=low)
     d.share.halo.most(low)
     np.negative(low, out=low)
+
+
+def _watch(d: Discretisation, flags: Numbers, owner: Numbers, node_owner: Numbers, moved: Unknowns) -> Floats:
+    """1 / eps of the unknowns that decide whether the set still holds, 0 of the others."""
+    watch, table, switch = np.zeros(d.nodes, dtype=np.int64), d.shape, d.case.activation
+    kernels.watch_nodes(
+        watch, flags, owner, node_owner, table.offsets, table.nodes, table.rows, table.table,
+        d.nearest.kind, d.nearest.starts, d.nearest.places,
+    )
+    column = np.repeat(moved.strips.column, np.diff(moved.strips.first))
+    bits = watch[moved.nodes]
+    alone = np.where(bits >> column & 1, 1.0 / (SLOT_EPS * switch.eps_eta), 0.0)
+    return np.where(bits & 1, 1.0 / np.where(column == 0, switch.eps_rho, switch.eps_eta), alone)
+
+
+def _seen_by(d: Discretisation, chosen: Integers) -> Flags:
+    """Which nodes of this rank the chosen points see."""
+    flags, seen = np.zeros(d.shape.points, dtype=bool), np.zeros(d.nodes, dtype=np.int8)
+    flags[chosen] = True
+    kernels.touch(seen, flags, d.shape.offsets, d.shape.nodes)
+    return seen.astype(bool)
 
 
 def _touched(d: Discretisation, chosen: Flags) -> Flags:

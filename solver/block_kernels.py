@@ -476,24 +476,3 @@ def to_columns(columns: Floats, u: Floats, listed: Integers) -> None:
                 for k in range(LANES):
                     columns[c + k, a] = u[a, c + k]
                 i += 1
-
-
-@jit
-def add_columns(u: Floats, columns: Floats, listed: Integers) -> None:
-    """u[a, c] += columns[c, a], and columns[c, a] = 0, at the listed nodes."""
-    square = np.empty((LANES, LANES))
-    for c in range(0, u.shape[1], LANES):
-        i = 0
-        while i < listed.size:
-            a = listed[i]
-            if i + LANES <= listed.size and listed[i + LANES - 1] == a + LANES - 1:
-                transpose(columns, c, a, square, 0, 0)
-                for k in range(LANES):
-                    store(columns, c + k, a, splat(0.0))
-                    store(u, a + k, c, load(u, a + k, c) + load(square, k, 0))
-                i += LANES
-            else:
-                for k in range(LANES):
-                    u[a, c + k] += columns[c + k, a]
-                    columns[c + k, a] = 0.0
-                i += 1

@@ -77,7 +77,7 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     local = np.full(len(mesh.nodes), -1, dtype=np.int32)
     local[nodes] = np.arange(nodes.size, dtype=np.int32)
     kernels.renumber(table.nodes, local)
-    share = Share(ranks, points, nodes, Halo(ranks, nodes), len(mesh.nodes))
+    share = Share(ranks, points, nodes, Halo.of_nodes(ranks, nodes), len(mesh.nodes))
     size = np.asarray(case.domain.size)
     x = mesh.points[points] - 0.5 * size
     weights = np.ascontiguousarray(mesh.weights[points])

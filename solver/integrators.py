@@ -1,6 +1,6 @@
 """Steps in time: `rk2` as the paper prints it, and `adaptive`, a stabilised Runge-Kutta-Chebyshev method.
 
-An integrator sees the problem only through `Scheme.rates` and the list of nodes that change. It owns its work arrays;
+An integrator sees the problem only through `Scheme.rates`, a function of vectors (`unknowns`). It owns its work arrays;
 `memory` holds what a checkpoint needs so that a resumed run takes the same steps.
 """
 
@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from . import kernels
+from . import unknowns, vectors
 from .arrays import Floats
 from .case import Case
 from .partition import Ranks
@@ -26,7 +26,7 @@ class Integrator(Protocol):
         """Advance the state by one step, not beyond `limit`."""
 
     def at(self, scheme: Scheme, state: State, time: float) -> Floats:
-        """The fields (n, F) at a time within the last step; valid until the next call."""
+        """The fields (n, F) at a time within the last step."""
 
     def restart(self, scheme: Scheme, state: State) -> None:
         """The set of live points or the layout of the slots has changed."""
@@ -58,17 +58,17 @@ class RK2:
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
-        self.rate = np.empty((0, 0))
+        self.y = self.rate = np.empty(0)
 
     def step(self, scheme: Scheme, state: State, limit: float) -> None:
         """One step of the equal steps, at most dt, that lead to the limit."""
         remaining = limit - state.time
         count = max(1, ceil(remaining / self.dt - 1e-9))
         dt = remaining / count
-        nodes = scheme.active.nodes
         for _ in range(2):
-            scheme.rates(state.u, self.rate)
-            kernels.advance(state.u, state.u, 0.5 * dt, self.rate, nodes)
+            scheme.rates(self.y, self.rate)
+            vectors.advance(self.y, self.y, 0.5 * dt, self.rate)
+        scheme.active.unknowns.put(state.u, self.y)
         state.evaluations += 2
         state.time = limit if count == 1 else state.time + dt
         state.step += 1
@@ -78,9 +78,9 @@ class RK2:
         return state.u
 
     def restart(self, scheme: Scheme, state: State) -> None:
-        """Only the shape of the work array can change."""
-        if self.rate.shape != state.u.shape:
-            self.rate = np.zeros_like(state.u)
+        """Go on from the state's fields."""
+        self.y = scheme.active.unknowns.take(state.u)
+        self.rate = np.empty_like(self.y)
 
     @property
     def memory(self) -> dict[str, float]:
@@ -122,9 +122,9 @@ class Chebyshev:
         self.age = kept.get("age", 0.0)
         self.error_before = kept.get("error_before", 0.0)
         self.dt_before = kept.get("dt_before", 0.0)
-        self.work: list[Floats] = []  # of fields; at nodes that stand still they and state.u are the same
-        self.old = self.rate_0 = self.rate_1 = np.empty((0, 0))
-        self.fresh = False  # whether rate_1 is F(state.u)
+        self.work: list[Floats] = []
+        self.y = self.old = self.rate_0 = self.rate_1 = np.empty(0)  # after a step and before it, and their rates
+        self.fresh = False  # whether rate_1 is F(y)
         self.start = 0.0
 
     @property
@@ -136,23 +136,18 @@ class Chebyshev:
         }  # fmt: skip
 
     def restart(self, scheme: Scheme, state: State) -> None:
-        """Fit the work arrays to the state and forget the last rate."""
-        if self.old.shape != state.u.shape:
-            self.work = [np.zeros_like(state.u) for _ in range(2)]
-            self.old, self.rate_0, self.rate_1 = (np.zeros_like(state.u) for _ in range(3))
-        for array in self.work:
-            array[:] = state.u
-        self.rate_0[:] = self.rate_1[:] = 0.0
+        """Go on from the state's fields; rates known before hold no more."""
+        self.y = scheme.active.unknowns.take(state.u)
+        self.old, self.rate_0, self.rate_1, *self.work = (np.zeros_like(self.y) for _ in range(5))
         self.fresh = False
 
     def step(self, scheme: Scheme, state: State, limit: float) -> None:
         """Try steps until one is accepted."""
-        nodes = scheme.active.nodes
-        kernels.start(self.old, state.u, nodes)
+        self.old, self.y = self.y, self.old
         if self.fresh:
             self.rate_0, self.rate_1 = self.rate_1, self.rate_0
         else:
-            scheme.rates(state.u, self.rate_0, self.tau)
+            scheme.rates(self.old, self.rate_0, self.tau)
             state.evaluations += 0 if self.repeats else 1
         self.repeats = False
         if self.radius == 0.0 or self.age >= ESTIMATE_EVERY:
@@ -172,17 +167,15 @@ class Chebyshev:
             rejected = True
             if not self.dt > 1e-12 * max(limit, 1.0):
                 raise FloatingPointError(f"step size fell to {self.dt:.1e} at t = {state.time:.6g}")
+        scheme.active.unknowns.put(state.u, self.y)
         self._accept(state, dt, error, limit)
 
     def at(self, scheme: Scheme, state: State, time: float) -> Floats:
         """The cubic Hermite interpolant of the last step: of higher order than the method."""
         dt = state.time - self.start
         theta = (time - self.start) / dt
-        kernels.start(self.work[0], state.u, np.arange(len(state.u)))
-        kernels.hermite(
-            self.work[0], self.old, self.rate_0, state.u, self.rate_1, dt, theta, scheme.active.nodes
-        )
-        return self.work[0]
+        vectors.hermite(self.work[0], self.old, self.rate_0, self.y, self.rate_1, dt, theta)
+        return scheme.active.unknowns.put(state.u.copy(), self.work[0])
 
     def _fit(self, remaining: float) -> float:
         """The next step: at most what `MOST_STAGES` can do, and no sliver left before the limit."""
@@ -192,26 +185,26 @@ class Chebyshev:
         return min(dt, 0.5 * remaining) if dt > 0.5 * remaining else dt
 
     def _try(self, scheme: Scheme, state: State, dt: float) -> float:
-        """Fill state.u with the new fields and rate_1 with their rate; the error in units of the tolerance."""
-        nodes = scheme.active.nodes
+        """Fill y with the new fields and rate_1 with their rate; the error in units of the tolerance."""
         stages = max(2, 1 + int(sqrt(1.0 + 1.54 * dt * self.radius)))
         before, last = self.work
-        new, rate = state.u, self.rate_1  # what is in them is needed no more
-        kernels.start(before, self.old, nodes)
+        new, rate = self.y, self.rate_1  # what is in them is needed no more
+        before[:] = self.old
         for j, c in enumerate(coefficients(stages, dt), start=1):
             if j == 1:
-                kernels.advance(last, self.old, c[4], self.rate_0, nodes)
+                vectors.advance(last, self.old, c[4], self.rate_0)
                 continue
             scheme.rates(last, rate)
-            kernels.chebyshev_stage(new, self.old, before, last, rate, self.rate_0, c, nodes)
+            vectors.chebyshev_stage(new, self.old, before, last, rate, self.rate_0, c)
             before, last, new = last, new, before
-        state.u, self.work = last, [before, new]
+        self.y, self.work = last, [before, new]
         self.tau = max(self.least_tau, THETA * dt)
-        scheme.rates(state.u, self.rate_1, self.tau)
+        scheme.rates(self.y, self.rate_1, self.tau)
         state.evaluations += stages
         sums = np.empty(2)
-        kernels.chebyshev_error(
-            sums, state.u, self.old, self.rate_1, self.rate_0, dt, scheme.d.mass, self.tolerance, scheme.active.owned
+        unknowns.step_error(
+            sums, self.y, self.old, self.rate_1, self.rate_0, dt, self.tolerance, scheme.d.mass,
+            scheme.active.unknowns.strips,
         )
         scheme.d.share.ranks.sum(sums)
         return float(np.sqrt(sums[0] / sums[1])) if sums[1] > 0.0 else 0.0
@@ -234,23 +227,23 @@ class Chebyshev:
 
         It starts from the rate with signs that change from node to node: the stiffest modes are among the shortest.
         """
-        nodes, ranks = scheme.active.nodes, scheme.d.share.ranks
+        places, ranks = scheme.active.unknowns, scheme.d.share.ranks
         (moved, direction), rate = self.work, self.rate_1
-        size = sqrt(_total(ranks, kernels.squares(self.old, scheme.active.owned)))
-        length = sqrt(_total(ranks, kernels.squares(self.rate_0, scheme.active.owned)))
+        size = sqrt(_total(ranks, unknowns.squares(self.old, places.strips)))
+        length = sqrt(_total(ranks, unknowns.squares(self.rate_0, places.strips)))
         if length == 0.0:
             self.radius, self.age = 1.0, 0
             return
         delta = 1e-7 * max(size, 1.0)
-        kernels.start(direction, self.rate_0, nodes)
-        direction[nodes[scheme.d.share.nodes[nodes] * 2654435761 % 2**32 >= 2**31]] *= -1.0
+        flipped = scheme.d.share.nodes[places.nodes] * 2654435761 % 2**32 >= 2**31
+        np.copyto(direction, np.where(flipped, -self.rate_0, self.rate_0))
         radius = 0.0
         for _ in range(50):
-            kernels.advance(moved, self.old, delta / length, direction, nodes)
+            vectors.advance(moved, self.old, delta / length, direction)
             scheme.rates(moved, rate)
             state.evaluations += 1
-            kernels.difference(direction, rate, self.rate_0, 1.0, nodes)
-            length = sqrt(_total(ranks, kernels.squares(direction, scheme.active.owned)))
+            vectors.difference(direction, rate, self.rate_0)
+            length = sqrt(_total(ranks, unknowns.squares(direction, places.strips)))
             previous, radius = radius, length / delta
             if abs(radius - previous) <= 0.01 * radius or length == 0.0:
                 break

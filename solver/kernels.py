@@ -652,22 +652,6 @@ def add_still_drift(
 
 
 @jit
-def add_moments(
-    moments: Floats, u: Floats, listed: Integers, node_owner: Numbers, mass: Floats, first_moment: Floats
-) -> None:
-    """moments[a] += (m_b eta_b, q_b eta_b) over the listed nodes b: V_a and int r eta_a as exact nodal sums."""
-    for i in range(listed.size):
-        b = listed[i]
-        for s in range(node_owner.shape[1]):
-            a = node_owner[b, s]
-            if a >= 0:
-                eta = u[b, 1 + s]
-                moments[a, 0] += mass[b] * eta
-                for k in range(first_moment.shape[1]):
-                    moments[a, 1 + k] += first_moment[b, k] * eta
-
-
-@jit
 def largest_slope(most: Floats, table: Floats, starts: Integers, longest: int) -> None:
     """most[0] becomes the largest sum of |dN/dx| + |dN/dy| [+ |dN/dz|] over a row, starts[i] its first column."""
     for i in range(starts.size):
@@ -744,64 +728,10 @@ def start(array: Floats, values: Floats, listed: Integers) -> None:
 
 
 @jit
-def clear(array: Floats, listed: Integers) -> None:
-    """array[a, :] = 0 at the listed nodes."""
-    for i in range(listed.size):
-        for column in range(0, array.shape[1], LANES):
-            store(array, listed[i], column, splat(0.0))
-
-
-@jit
-def divide_rates(rate: Floats, mass: Floats, owner: Numbers, listed: Integers) -> None:
-    """rate[a, :] /= m_a at the listed nodes; 0 in slots that no particle has there."""
-    mode = flush_denormals()
-    slots = owner.shape[1]
-    for i in range(listed.size):
-        a = listed[i]
-        factor = 1.0 / mass[a]
-        rate[a, 0] *= factor
-        for s in range(slots):
-            rate[a, 1 + s] *= factor if owner[a, s] >= 0 else 0.0
-        for column in range(1 + slots, rate.shape[1]):
-            rate[a, column] = 0.0
-    restore_denormals(mode)
-
-
-@jit
 def divide_values(array: Floats, mass: Floats, listed: Integers) -> None:
     """array[a] /= m_a at the listed nodes, one value each."""
     for i in range(listed.size):
         array[listed[i]] /= mass[listed[i]]
-
-
-@jit
-def advance(new: Floats, old: Floats, dt: float, rate: Floats, listed: Integers) -> None:
-    """new = old + dt rate at the listed nodes."""
-    mode = flush_denormals()
-    for i in range(listed.size):
-        a = listed[i]
-        for column in range(0, new.shape[1], LANES):
-            store(new, a, column, load(old, a, column) + dt * load(rate, a, column))
-    restore_denormals(mode)
-
-
-@jit
-def largest_change(
-    u: Floats, reference: Floats, watched: Integers, watch: Integers, eps_rho: float, eps_eta: float, eps_slot: float
-) -> float:
-    """max |u - reference| / eps over the watched nodes and fields; eps_slot where only a missing slot is watched."""
-    largest = 0.0
-    for i in range(watched.size):
-        a = watched[i]
-        bits = watch[a]
-        if bits & 1:
-            largest = max(largest, abs(u[a, 0] - reference[a, 0]) / eps_rho)
-        for c in range(1, u.shape[1]):
-            if bits & 1:
-                largest = max(largest, abs(u[a, c] - reference[a, c]) / eps_eta)
-            elif bits & (np.int64(1) << c):
-                largest = max(largest, abs(u[a, c] - reference[a, c]) / eps_slot)
-    return largest
 
 
 @jit
@@ -813,71 +743,3 @@ def first_outside(u: Floats, listed: Integers, at_wall: Flags, low: float, high:
             if not (low <= u[a, c] <= (rho_at_wall if c == 0 and at_wall[a] else high)):
                 return int(a)
     return -1
-
-
-@jit
-def chebyshev_stage(
-    new: Floats, old: Floats, before: Floats, last: Floats, rate: Floats, rate_0: Floats, c: Floats, listed: Integers
-) -> None:
-    """new = c_0 Y_0 + c_1 Y_{j-1} + c_2 Y_{j-2} + c_3 F_{j-1} + c_4 F_0 at the listed nodes."""
-    mode = flush_denormals()
-    for i in range(listed.size):
-        a = listed[i]
-        for column in range(0, new.shape[1], LANES):
-            y = c[0] * load(old, a, column) + c[1] * load(last, a, column) + c[2] * load(before, a, column)
-            store(new, a, column, y + c[3] * load(rate, a, column) + c[4] * load(rate_0, a, column))
-    restore_denormals(mode)
-
-
-@jit
-def chebyshev_error(
-    sums: Floats, new: Floats, old: Floats, rate_1: Floats, rate_0: Floats, dt: float,
-    mass: Floats, tolerance: float, listed: Integers,
-) -> None:
-    """sums = sum_a m_a sum_fields (e / (tolerance (1 + |u|)))^2 and sum_a m_a over the listed nodes;
-
-    e = 0.8 (y_n - y_{n+1}) + 0.4 dt (F_n + F_{n+1}).
-    """
-    sums[:] = 0.0
-    for i in range(listed.size):
-        a = listed[i]
-        square = 0.0
-        for c in range(new.shape[1]):
-            error = 0.8 * (old[a, c] - new[a, c]) + 0.4 * dt * (rate_0[a, c] + rate_1[a, c])
-            error /= tolerance * (1.0 + abs(new[a, c]))
-            square += error * error
-        sums[0] += mass[a] * square
-        sums[1] += mass[a]
-
-
-@jit
-def squares(u: Floats, listed: Integers) -> float:
-    """sum u^2 over the listed nodes and all fields."""
-    total = 0.0
-    for i in range(listed.size):
-        for c in range(u.shape[1]):
-            total += u[listed[i], c] * u[listed[i], c]
-    return total
-
-
-@jit
-def difference(new: Floats, a: Floats, b: Floats, factor: float, listed: Integers) -> None:
-    """new = factor (a - b) at the listed nodes."""
-    for i in range(listed.size):
-        for c in range(new.shape[1]):
-            new[listed[i], c] = factor * (a[listed[i], c] - b[listed[i], c])
-
-
-@jit
-def hermite(
-    new: Floats, old: Floats, rate_0: Floats, u: Floats, rate_1: Floats, dt: float, theta: float, listed: Integers
-) -> None:
-    """The cubic through (old, rate_0) and (u, rate_1) a step dt apart, at the fraction theta of the step."""
-    h00 = (1.0 + 2.0 * theta) * (1.0 - theta) ** 2
-    h10 = theta * (1.0 - theta) ** 2 * dt
-    h01 = theta * theta * (3.0 - 2.0 * theta)
-    h11 = theta * theta * (theta - 1.0) * dt
-    for i in range(listed.size):
-        a = listed[i]
-        for c in range(new.shape[1]):
-            new[a, c] = h00 * old[a, c] + h10 * rate_0[a, c] + h01 * u[a, c] + h11 * rate_1[a, c]

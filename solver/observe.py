@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from . import box, kernels
+from . import box, kernels, unknowns
 from .arrays import Floats
 from .case import Case
 from .discretisation import Discretisation
@@ -32,7 +32,9 @@ class Observables:
         d, table, owned = self.d, self.d.shape, self.d.share.owned
         sums = np.zeros(5 + self.particles * (1 + d.dim))
         moments = sums[5:].reshape(self.particles, 1 + d.dim)
-        kernels.add_moments(moments, u, owned, state.owner, d.mass, d.first_moment)
+        moments += scheme.active.moments
+        places = scheme.active.unknowns
+        unknowns.add_moments(moments, places.take(u), d.mass, d.first_moment, places.strips)
         sums[0] = d.mass[owned] @ u[owned, 0]
         sums[1] = kernels.free_energy(
             u, d.weights, d.dim, table.offsets, table.nodes, table.rows, table.table, d.coefficients

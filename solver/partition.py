@@ -98,24 +98,37 @@ def bisect(points: Floats, weights: Floats, parts: int) -> Integers:
 
 
 class Halo:
-    """The nodes this rank shares with others, and the exchange of values there."""
+    """The places of an array that this rank shares with others, and the exchange of values there."""
 
-    def __init__(self, ranks: Ranks, nodes: Integers) -> None:
-        """nodes: the global numbers of this rank's nodes, sorted. Collective."""
-        self.ranks = ranks
-        self.neighbours: list[tuple[int, Integers]] = []
-        self.owned = np.ones(nodes.size, dtype=bool)
-        for rank, theirs in enumerate(ranks.everyones(nodes)):
-            if rank == ranks.rank:
-                continue
-            common = np.flatnonzero(np.isin(nodes, theirs, assume_unique=True))
-            if common.size:
-                self.neighbours.append((rank, common))
-                if rank < ranks.rank:
-                    self.owned[common] = False
-        shared = [common for _, common in self.neighbours]
+    def __init__(self, ranks: Ranks, size: int, neighbours: list[tuple[int, Integers]]) -> None:
+        """neighbours: other ranks, and where their values belong here, in the same order there."""
+        self.ranks, self.neighbours = ranks, neighbours
+        self.owned = np.ones(size, dtype=bool)
+        for rank, common in neighbours:
+            if rank < ranks.rank:
+                self.owned[common] = False
+        shared = [common for _, common in neighbours]
         self.shared = np.unique(np.concatenate(shared)) if shared else np.empty(0, dtype=np.int64)
-        self.in_pairs = sum(common.size for common in shared) == self.shared.size  # no node has three holders
+        self.in_pairs = sum(common.size for common in shared) == self.shared.size  # no place has three holders
+
+    @classmethod
+    def of_nodes(cls, ranks: Ranks, nodes: Integers) -> "Halo":
+        """nodes: the global numbers of this rank's nodes, sorted. Collective."""
+        neighbours = []
+        for rank, theirs in enumerate(ranks.everyones(nodes)):
+            if rank != ranks.rank:
+                common = np.flatnonzero(np.isin(nodes, theirs, assume_unique=True))
+                neighbours += [(rank, common)] if common.size else []
+        return cls(ranks, nodes.size, neighbours)
+
+    def of(self, places: Integers) -> "Halo":
+        """The halo of an array whose entry i belongs to places[i] of this one; all ranks must have the same order."""
+        neighbours, known = [], np.zeros(self.owned.size, dtype=bool)
+        for rank, common in self.neighbours:
+            known[:] = False
+            known[common] = True
+            neighbours.append((rank, np.flatnonzero(known[places])))
+        return Halo(self.ranks, places.size, neighbours)
 
     def add(self, array: Array) -> None:
         """Replace each shared node's partial sum by the sum over its holders, in place; (n,) or (n, F)."""

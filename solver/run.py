@@ -125,7 +125,7 @@ def renew(scheme: Scheme, state: State) -> bool:
     switch = scheme.d.case.activation
     if state.step == 0 or not (switch.enabled or switch.few_order_parameters):
         return False
-    moved = np.array([scheme.active.stale(state.u, switch.eps_rho, switch.eps_eta)])
+    moved = np.array([scheme.active.stale(state.u)])
     scheme.d.share.ranks.max(moved)
     if moved[0] < LAG and state.step % REFRESH:
         return False

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from . import block_kernels, kernels, rigid
+from . import block_kernels, kernels, rigid, unknowns
 from .active import Active, activate
 from .arrays import Floats
 from .discretisation import Discretisation
@@ -42,10 +42,11 @@ class Scheme:
     def _activate(self, state: State) -> None:
         self.active: Active = activate(self.d, state)
         d, a, columns = self.d, self.active, state.u.shape[1]
-        self.slot_of, self.node_owner = state.slot_of, state.owner
+        self.slot_of = state.slot_of
 
-        # Nodes: W; fields, and rates (0 between evaluations), by columns for the points in blocks: `block_kernels`
+        # Nodes: W; fields, and rates (0 between evaluations), by columns for blocks and by rows for loose points
         self.u_columns, self.rate_columns = np.zeros((2, columns, d.nodes + LANES))
+        self.u_rows, self.rate_rows = np.zeros((2, d.nodes, columns))
         self.W_row = np.zeros((1, d.nodes + LANES))
         self.W = self.W_row[0, : d.nodes]
 
@@ -71,8 +72,8 @@ class Scheme:
             kept = self.rooms[name] = np.zeros(rows * columns + rows * columns // 16)
         return kept[: rows * columns].reshape(rows, columns)
 
-    def rates(self, u: Floats, rate: Floats, tau: float | None = None) -> None:
-        """Write d rho/dt (3) and d eta/dt (4) at the live nodes into rate (n, F). Collective.
+    def rates(self, y: Floats, rate: Floats, tau: float | None = None) -> None:
+        """Write d rho/dt (3) and d eta/dt (4) into rate, a vector as y: `unknowns`. Collective.
 
         tau: measure the contacts' stiffness here, and from now on let them relax no faster than 1 / tau around the
         motion of the evaluation before; see `rigid.Relaxation`.
@@ -84,14 +85,14 @@ class Scheme:
 
         # Fields and gradients at the points (17), mobility (5), and the potential (24)
         #   W_a = 1/m_a sum_p w_p [ N_a df/drho + kappa_rho grad N_a . grad rho_p ]
-        self._gather(u)
+        self._gather(y)
         kernels.divide_values(self.W, d.mass, a.nodes)
 
         # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
         watch.enter("rigid motion")
         if moving:
             self._meet()
-            forces, moments = self._bodies(u)
+            forces, moments = self._bodies(y)
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
                 self.carried = self.motion
@@ -103,7 +104,6 @@ class Scheme:
         #   rate eta_a = 1/m_a sum_p w_p [ -L N_a df/deta + grad N_a . ( -L kappa_eta grad eta_p + eta_p v_a ) ]
         watch.enter("scatter")
         self._scatter(rate)
-        kernels.divide_rates(rate, d.mass, self.node_owner, a.nodes)
         watch.enter(before)
 
     def imbalance(self) -> float:
@@ -123,23 +123,23 @@ class Scheme:
         )
         return d.share.ranks.sum(stiffness)
 
-    def _gather(self, u: Floats) -> None:
+    def _gather(self, y: Floats) -> None:
         """Fields and D of this rank's points in the work arrays, and W summed over the ranks."""
         d, a = self.d, self.active
         kernels.start(self.W, a.potential, a.nodes)
-        block_kernels.to_columns(self.u_columns, u, a.nodes)
+        unknowns.spread(self.u_columns, self.u_rows, y, a.unknowns.strips)
         self.touches = 0
-        self._potential(u, (0, a.loose_border), (0, a.blocks.border))
+        self._potential((0, a.loose_border), (0, a.blocks.border))
         under_way = d.share.halo.start(self.W)  # what goes to shared nodes is complete; the rest is done meanwhile
-        self._potential(u, (a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
+        self._potential((a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
         d.share.halo.finish(self.W, under_way)
 
-    def _potential(self, u: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
+    def _potential(self, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
         """The part of `_gather` for some of the loose points and blocks."""
         d, a, table = self.d, self.active, self.d.shape
         if loose[0] < loose[1]:
             self.touches = kernels.potential(
-                self.W, self.touching, self.point, self.D, self.S2, u, a.loose, a.mask, a.present, a.several,
+                self.W, self.touching, self.point, self.D, self.S2, self.u_rows, a.loose, a.mask, a.present, a.several,
                 d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
                 *loose, self.touches,
             )
@@ -152,26 +152,28 @@ class Scheme:
             )
 
     def _scatter(self, rate: Floats) -> None:
-        """Sources and fluxes of all points in rate, times m_a, after `_gather` and once the motion is known."""
+        """Sources and fluxes of all points in rate, after `_gather` and once the motion is known."""
         d, a = self.d, self.active
-        kernels.clear(rate, a.nodes)
         if d.case.model.rigid_motion:
-            kernels.add_still_drift(rate, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion)
+            kernels.add_still_drift(
+                self.rate_rows, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion
+            )
         motion = rigid.in_space(self.motion)
-        self._divergence(rate, motion, (0, a.loose_border), (0, a.blocks.border))
-        block_kernels.add_columns(rate, self.rate_columns, a.shared)
-        under_way = d.share.halo.start(rate)
-        self._divergence(rate, motion, (a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
-        block_kernels.add_columns(rate, self.rate_columns, a.inner)
-        d.share.halo.finish(rate, under_way)
+        sums, strips = (self.rate_columns, self.rate_rows, d.mass), a.unknowns.strips
+        self._divergence(motion, (0, a.loose_border), (0, a.blocks.border))
+        unknowns.collect(rate, *sums, strips, 0, a.unknowns.shared)
+        under_way = a.unknowns.halo.start(rate)
+        self._divergence(motion, (a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
+        unknowns.collect(rate, *sums, strips, a.unknowns.shared, strips.node.size)
+        a.unknowns.halo.finish(rate, under_way)
 
-    def _divergence(self, rate: Floats, motion: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
-        """The part of `_scatter` for some of the loose points and blocks; those of the blocks go to `rate_columns`."""
+    def _divergence(self, motion: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
+        """The part of `_scatter` for some of the loose points and blocks, before the 1/m_a."""
         d, a, table = self.d, self.active, self.d.shape
         moving = d.case.model.rigid_motion
         if loose[0] < loose[1]:
             kernels.divergence(
-                rate, self.point, self.D, self.S2, self.W, motion, self.velocity,
+                self.rate_rows, self.point, self.D, self.S2, self.W, motion, self.velocity,
                 a.loose, a.owner, a.present, d.weights, d.x,
                 table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang, *loose,
             )
@@ -205,7 +207,7 @@ class Scheme:
         self.where = np.empty(pairs, dtype=np.int64)
         self.share = np.empty(pairs)
 
-    def _bodies(self, u: Floats) -> tuple[Floats, Floats]:
+    def _bodies(self, y: Floats) -> tuple[Floats, Floats]:
         """Contact forces and moments of all particles, summed over the ranks, after `_meet`."""
         d, a = self.d, self.active
         self.sums[:] = 0.0
@@ -213,6 +215,6 @@ class Scheme:
             self.forces, self.meetings, self.contacts, self.between, self.where, self.share, d.x, d.coefficients
         )
         self.moments += a.moments
-        kernels.add_moments(self.moments, u, a.owned, self.node_owner, d.mass, d.first_moment)
+        unknowns.add_moments(self.moments, y, d.mass, d.first_moment, a.unknowns.strips)
         d.share.ranks.sum(self.sums)
         return self.forces, self.moments

@@ -53,6 +53,14 @@ class Result:
         return np.where(self.state.owner[:, slot] == particle, self.state.u[:, 1 + slot], 0.0)
 
 
+def rates_of(scheme: Scheme, state: State, tau: float | None = None) -> Floats:
+    """The rates of change of all fields (n, F); 0 where nothing changes."""
+    places = scheme.active.unknowns
+    rate = np.full(places.size, np.nan)
+    scheme.rates(places.take(state.u), rate, tau)
+    return places.put(np.zeros_like(state.u), rate)
+
+
 def simulate(tree: dict[str, Any]) -> Result:
     """Run the case of this tree."""
     case, ranks = parse_case(tree), Ranks()

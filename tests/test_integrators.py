@@ -2,6 +2,7 @@
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,13 +10,15 @@ import numpy as np
 import pytest
 from numpy.polynomial import Chebyshev as Series
 from numpy.polynomial import Polynomial
+from simulate import rates_of
 
-from frit.solver.arrays import Floats
+from frit.solver.arrays import Floats, Integers
 from frit.solver.case import Case, parse_case
 from frit.solver.integrators import RK2, Chebyshev, coefficients, contact_time, paper_step
-from frit.solver.partition import Ranks
+from frit.solver.partition import Halo, Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
 from frit.solver.state import State
+from frit.solver.unknowns import OWNED, lay_out
 
 Field = Callable[[Floats], Floats]
 ANY = 1e9  # a tolerance that lets every step pass
@@ -24,17 +27,23 @@ ANY = 1e9  # a tolerance that lets every step pass
 class Problem:
     """Stands in for a Scheme: du/dt = f(u) with a known solution, of which an integrator sees nothing but this."""
 
-    def __init__(self, f: Field, nodes: int) -> None:
+    def __init__(self, f: Field, nodes: int, columns: int) -> None:
         self.f = f
         everywhere = np.arange(nodes)
-        self.active = SimpleNamespace(nodes=everywhere, owned=everywhere)
         self.d = SimpleNamespace(mass=np.ones(nodes), share=SimpleNamespace(ranks=Ranks(), nodes=everywhere))
-
         self.relax = None
+        self.only(everywhere, columns)
 
-    def rates(self, u: Floats, rate: Floats, tau: float | None = None) -> None:
+    def only(self, changing: Integers, columns: int = 1) -> None:
+        """From now on only these nodes change."""
+        owner = np.zeros((self.d.mass.size, columns - 1), dtype=np.int32)
+        kind = np.full(self.d.mass.size, OWNED)
+        self.active = SimpleNamespace(unknowns=lay_out(changing, owner, kind, Halo(Ranks(), self.d.mass.size, [])))
+
+    def rates(self, y: Floats, rate: Floats, tau: float | None = None) -> None:
         """Nothing touches here: tau means nothing."""
-        rate[:] = self.f(u)
+        places, fields = self.active.unknowns, np.zeros((self.d.mass.size, 8))
+        rate[:] = places.take(self.f(places.put(fields, y)))
 
 
 def start(f: Field, u: Floats) -> tuple[Any, State]:
@@ -43,7 +52,7 @@ def start(f: Field, u: Floats) -> tuple[Any, State]:
     fields = np.zeros((len(u), 8))
     fields[:, : given.shape[1]] = given
     none = np.full((len(u), 0), -1, dtype=np.int32)
-    return Problem(f, len(u)), State(0.0, 0, 0, fields, none, np.empty(0, dtype=np.int32))
+    return Problem(f, *given.shape), State(0.0, 0, 0, fields, none, np.empty(0, dtype=np.int32))
 
 
 def decay(u: Floats) -> Floats:
@@ -70,14 +79,13 @@ def test_rk2_is_two_half_euler_steps(ranks: Ranks) -> None:
     """Equation (32) as printed, by hand on the real scheme. A multiply-add rounds once where numpy rounds twice."""
     case = discs()
     scheme, state = prepare(case, build_mesh(case, ranks), ranks)
-    rate, u, dt = np.zeros_like(state.u), state.u.copy(), 1e-3
+    own, dt = replace(state, u=state.u.copy()), 1e-3
     for _ in range(2):
-        scheme.rates(u, rate)
-        u[scheme.active.nodes] += 0.5 * dt * rate[scheme.active.nodes]
+        own.u += 0.5 * dt * rates_of(scheme, own)
     integrator = RK2(dt)
     integrator.restart(scheme, state)
     integrator.step(scheme, state, dt)
-    np.testing.assert_allclose(state.u, u, rtol=1e-14, atol=1e-16)
+    np.testing.assert_allclose(state.u, own.u, rtol=1e-14, atol=1e-16)
     assert (state.time, state.step, state.evaluations) == (dt, 1, 2)
 
 
@@ -344,9 +352,9 @@ def test_values_between_steps_are_exact_for_a_cubic() -> None:
     integrator = Chebyshev(ANY, 0.0)
     integrator.restart(problem, state)
     integrator.start, state.time = 0.3, 1.1
-    for time, field, rate in ((0.3, integrator.old, integrator.rate_0), (1.1, state.u, integrator.rate_1)):
-        field[:, 0] = [p(time) for p in cubics]
-        rate[:, 0] = [p.deriv()(time) for p in cubics]
+    for time, field, rate in ((0.3, integrator.old, integrator.rate_0), (1.1, integrator.y, integrator.rate_1)):
+        field[:] = [p(time) for p in cubics]
+        rate[:] = [p.deriv()(time) for p in cubics]
     for time in (0.3, 0.31, 0.7, 1.0, 1.1):
         got = integrator.at(problem, state, time)[:, 0]
         np.testing.assert_allclose(got, [p(time) for p in cubics], rtol=0, atol=1e-14)
@@ -355,7 +363,7 @@ def test_values_between_steps_are_exact_for_a_cubic() -> None:
 def test_values_between_steps_are_as_good_as_the_steps() -> None:
     """u' = -u^2 at tolerance 1e-4, wherever in the steps; nodes that stand still keep their values."""
     problem, state = start(decay, VALUES)
-    problem.active.nodes = problem.active.owned = np.arange(8)
+    problem.only(np.arange(8))
     integrator = Chebyshev(1e-4, 0.0)
     integrator.restart(problem, state)
     while state.time < 1.0:
@@ -371,8 +379,8 @@ def test_nodes_that_stand_still_keep_their_values_whatever_the_stages() -> None:
     """u' = -500 u beside u' = -u: steps of few stages and of many, the spectral radius estimated once in 25 of them."""
     factors = np.where(np.arange(40) % 2, 1.0, 500.0)[:, None]
     problem, state = start(lambda u: -factors * u, np.linspace(0.2, 2.0, 40))
-    problem.active.nodes = problem.active.owned = np.arange(0, 40, 3)
-    still = np.setdiff1d(np.arange(40), problem.active.nodes)
+    problem.only(np.arange(0, 40, 3))
+    still = np.setdiff1d(np.arange(40), np.arange(0, 40, 3))
     before = state.u.copy()
     integrator = Chebyshev(1e-5, 0.0)
     integrator.restart(problem, state)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import reference
+from simulate import rates_of
 
 from frit.solver import active, kernels
 from frit.solver.arrays import Floats
@@ -55,12 +56,6 @@ def disturb(state: State, particles: int) -> None:
     """Random nodal values added to the initial ones: gradients everywhere, overlaps, values below 0 and above 1."""
     noise = np.random.default_rng(0).uniform(-0.1, 0.1, (len(state.u), 1 + particles))
     state.u[:, : 1 + particles] += noise
-
-
-def rates_of(scheme: Scheme, state: State) -> Floats:
-    rate = np.zeros_like(state.u)
-    scheme.rates(state.u, rate)
-    return rate
 
 
 def check(scheme: Scheme, state: State, mesh: Mesh, N: Floats, dN: Floats, tolerance: float) -> None:
@@ -214,7 +209,7 @@ def test_relaxed_contacts_are_an_implicit_step_of_the_forces(ranks: Ranks, dim: 
     free = scheme.motion.copy()
     carried = np.random.default_rng(3).normal(size=free.shape)
     scheme.motion = carried
-    scheme.rates(state.u, np.zeros_like(state.u), tau)
+    rates_of(scheme, state, tau)
     relaxed = scheme.motion.copy()
     rates_of(scheme, state)
     np.testing.assert_array_equal(scheme.motion, relaxed)

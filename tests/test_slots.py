@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulate import rates_of
 
 from frit.solver import active, slots
 from frit.solver.arrays import Floats, Integers, Numbers
@@ -163,9 +164,7 @@ def grid_case(
 def rates(ranks: Ranks, case: Case, mesh: Mesh, state: State | None) -> tuple[State, Floats, Integers]:
     """The state as the scheme has arranged it, its rates by particle, and the nodes that change."""
     scheme, own = prepare(case, mesh, ranks, state)
-    rate = np.zeros_like(own.u)
-    scheme.rates(own.u, rate)
-    return own, by_particle(rate, own.owner, len(own.slot_of)), scheme.active.nodes
+    return own, by_particle(rates_of(scheme, own), own.owner, len(own.slot_of)), scheme.active.nodes
 
 
 def one_each(state: State) -> State:

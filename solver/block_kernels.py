@@ -9,11 +9,13 @@ derivatives. Lanes without a live point have the weight 0: they see some nodes, 
 import numpy as np
 
 from .arrays import Flags, Floats, Integers, Numbers
-from .energy import Coefficients, df_deta, df_drho, mobility
+from .energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
 from .kernels import FAR, touching_share, x_velocity, y_velocity, z_velocity
-from .simd import LANES, flush_denormals, load, positive, restore_denormals, splat, store, transpose
+from .simd import LANES, flush_denormals, load, positive, restore_denormals, splat, store, total, transpose
+from .slots import MOST_SLOTS
 
+SMALLEST = float(np.finfo(np.float64).tiny)  # what is smaller counts as 0
 NOBODY = 1e9  # more than any number of a particle: those of several are compared as floats, eight at a time
 
 
@@ -324,6 +326,58 @@ def divergence(
 
 
 @jit
+def free_energy(
+    columns: Floats, points: Numbers, weights: Floats,
+    begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats, m: Coefficients,
+) -> float:
+    """`kernels.free_energy` for the points in blocks: of all fields that are not 0 at a node that a block sees."""
+    mode = flush_denormals()
+    width = table.shape[0]
+    slots = columns.shape[0] - 1
+    held = np.zeros(columns.shape[1] - LANES, dtype=np.int64)
+    fields_of_eight(held, columns, slots, SMALLEST, np.zeros(held.size, dtype=np.bool_))
+    fields = np.empty((2 * width, LANES))
+    present = np.empty(1 + slots, dtype=np.int64)
+    share = np.empty((1, LANES))
+    energy = 0.0
+    for b in range(points.shape[0]):
+        begin, count, start = begins[b], counts[b], starts[b]
+        some = np.int64(0)
+        for e in range(begin, begin + count):
+            some |= held[nodes[e]]
+        here = 0
+        for column in range(1 + slots):
+            present[here] = column
+            here += column == 0 or some >> bit(column) & 1 == 1
+        rho = splat(0.0)
+        S2 = splat(0.0)
+        S3 = splat(0.0)
+        gradients = splat(0.0)
+        for i in range(here):
+            if i % 2 == 0 and i + 1 < here:
+                gather_two(fields, 0, columns, present[i], present[i + 1], begin, count, start, nodes, table)
+            elif i % 2 == 0:
+                gather(fields, 0, columns, present[i], begin, count, start, nodes, table)
+            row = i % 2 * width
+            value = load(fields, row, 0)
+            kappa = m.kappa_rho if i == 0 else m.kappa_eta
+            for k in range(1, width):
+                slope = load(fields, row + k, 0)
+                gradients = gradients + kappa * slope * slope
+            if i == 0:
+                rho = value
+            else:
+                S2 = S2 + value * value
+                S3 = S3 + value * value * value
+        for j in range(LANES):
+            p = points[b, j]
+            share[0, j] = weights[p] if p >= 0 else 0.0
+        energy += total(load(share, 0, 0) * (free_energy_density(rho, S2, S3, m) + 0.5 * gradients))
+    restore_denormals(mode)
+    return energy
+
+
+@jit
 def sense(
     flags: Numbers, owner: Numbers, clash: Integers, columns: Floats, high: Floats, low: Floats,
     eps_rho: float, eps_eta: float, least: float, negligible: float, points: Numbers, changed: Flags,
@@ -359,7 +413,7 @@ def sense(
         pattern = kind[points[b, 0]]
         fields_here = 0
         for column in range(1 + owner.shape[1]):
-            if column == 0 or some >> column & 1:
+            if column == 0 or some >> bit(column) & 1:
                 present[fields_here] = column
                 fields_here += 1
         for i in range(fields_here):
@@ -433,15 +487,21 @@ def claim(
 
 @jit
 def fields_of_eight(held: Integers, columns: Floats, slots: int, least: float, changed: Flags) -> None:
-    """held[a], of the nodes a ... a + LANES - 1: bit 0 if one has changed, bit 1 + s if slot s is at least `least`."""
+    """held[a], of the nodes a ... a + LANES - 1: bit 0: one has changed; `bit` of a column: it is at least `least`."""
     for a in range(held.size):
         held[a] = changed[a]
-    for s in range(slots):
+    for column in range(1, 1 + slots):
         for a in range(held.size):
-            held[a] |= np.int64(abs(columns[1 + s, a]) >= least) << np.int64(1 + s)
+            held[a] |= np.int64(abs(columns[column, a]) >= least) << bit(column)
     for a in range(held.size):
         for j in range(1, min(LANES, held.size - a)):
             held[a] |= held[a + j]
+
+
+@inlined
+def bit(column: int) -> int:
+    """The bit of an order parameter's column in `fields_of_eight`: with more than `MOST_SLOTS` some share theirs."""
+    return int(np.int64(1 + (column - 1) % MOST_SLOTS))
 
 
 @jit

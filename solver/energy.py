@@ -32,10 +32,10 @@ class Coefficients(NamedTuple):
 
 
 @jit
-def free_energy_density(rho: float, S2: float, S3: float, m: Coefficients) -> float:
+def free_energy_density(rho: Field, S2: Field, S3: Field, m: Coefficients) -> Field:
     """f = A rho^2 (1 - rho)^2 + B [ rho^2 + 6 (1 - rho) S2 - 4 (2 - rho) S3 + 3 S2^2 ]   (2)"""
-    wells = m.A * rho**2 * (1.0 - rho) ** 2
-    return wells + m.B * (rho**2 + 6.0 * (1.0 - rho) * S2 - 4.0 * (2.0 - rho) * S3 + 3.0 * S2**2)
+    wells = m.A * rho * rho * (1.0 - rho) * (1.0 - rho)
+    return wells + m.B * (rho * rho + 6.0 * (1.0 - rho) * S2 - 4.0 * (2.0 - rho) * S3 + 3.0 * S2 * S2)
 
 
 @jit

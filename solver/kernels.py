@@ -403,13 +403,13 @@ def divergence(
 
 @jit
 def free_energy(
-    u: Floats, weights: Floats, dim: int,
+    u: Floats, weights: Floats, dim: int, loose: Integers,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, m: Coefficients,
 ) -> float:
-    """F = sum_p w_p [ f + kappa_rho/2 |grad rho|^2 + kappa_eta/2 sum |grad eta|^2 ] over this rank's points   (1)"""
+    """F = sum_p w_p [ f + kappa_rho/2 |grad rho|^2 + kappa_eta/2 sum |grad eta|^2 ] over the loose points   (1)"""
     point = np.empty((1 + dim, u.shape[1]))
     total = 0.0
-    for p in range(weights.size):
+    for p in loose:
         for column in range(0, u.shape[1], LANES):
             gather(point, u, 0, offsets[p], offsets[p + 1] - offsets[p], rows[p], nodes, table, column)
         S2 = 0.0

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from . import box, kernels, unknowns
+from . import block_kernels, box, kernels, unknowns
 from .arrays import Floats
 from .case import Case
 from .discretisation import Discretisation
@@ -12,6 +12,7 @@ from .geometry import Mesh
 from .neck import Neck
 from .partition import Collector
 from .scheme import Scheme
+from .simd import LANES
 from .state import State
 
 
@@ -29,17 +30,15 @@ class Observables:
 
     def row(self, scheme: Scheme, state: State, u: Floats, time: float, wall_time: float) -> dict[str, Any]:
         """One history row, named as in the run directory's history.jsonl."""
-        d, table, owned = self.d, self.d.shape, self.d.share.owned
+        d, owned = self.d, self.d.share.owned
         sums = np.zeros(5 + self.particles * (1 + d.dim))
         moments = sums[5:].reshape(self.particles, 1 + d.dim)
         moments += scheme.active.moments
         places = scheme.active.unknowns
         unknowns.add_moments(moments, places.take(u), d.mass, d.first_moment, places.strips)
         sums[0] = d.mass[owned] @ u[owned, 0]
-        sums[1] = kernels.free_energy(
-            u, d.weights, d.dim, table.offsets, table.nodes, table.rows, table.table, d.coefficients
-        )
-        sums[2:4] = scheme.active.live.size, table.points
+        sums[1] = free_energy(d, u)
+        sums[2:4] = scheme.active.live.size, d.shape.points
         sums[4] = self.box_weights @ u[:, 0]
         d.share.ranks.sum(sums)
         volumes = moments[:, 0]
@@ -65,6 +64,20 @@ class Observables:
         columns = [0, *(1 + state.slot_of)]
         fields = self.collector.whole(np.ascontiguousarray(u[:, columns]))
         return self.neck.measure(fields) if self.neck is not None and fields is not None else None
+
+
+def free_energy(d: Discretisation, u: Floats) -> float:
+    """F (1) of the fields u (n, F), this rank's part."""
+    table, blocks = d.shape, d.blocks
+    loose = kernels.free_energy(
+        u, d.weights, d.dim, blocks.loose, table.offsets, table.nodes, table.rows, table.table, d.coefficients
+    )
+    columns = np.zeros((u.shape[1], d.nodes + LANES))
+    block_kernels.to_columns(columns, u, np.arange(d.nodes))
+    return loose + block_kernels.free_energy(
+        columns, blocks.points, d.weights, blocks.begin, blocks.count, blocks.start, table.nodes, table.table,
+        d.coefficients,
+    )
 
 
 def distance(moments: Floats) -> float | None:

@@ -146,6 +146,29 @@ def test_rates_are_those_of_single_points(
     np.testing.assert_allclose(scheme.forces, single.forces, rtol=0, atol=1e-12 * scale)
 
 
+def test_more_particles_than_a_word_has_bits(ranks: Ranks, monkeypatch: pytest.MonkeyPatch) -> None:
+    """72 discs far apart, a column each: the same points live as where each is asked by itself."""
+    case = parse_case({
+        "domain": {"size": [132.0, 88.0]},
+        "nodes": {"spacing": 1.0},
+        "particles": {
+            "centres": [[6.0 + 11.0 * (k % 12), 6.0 + 15.0 * (k // 12)] for k in range(72)],
+            "radii": [2.5] * 72,
+            "interface_width": 0.5,
+        },
+        "time": {"end": 1.0},
+        "activation": {"few_order_parameters": False, "eps_rho": 1e-3, "eps_eta": 1e-3},
+    })  # fmt: skip
+    mesh = build_mesh(case, ranks)
+    scheme, state = prepare(case, mesh, ranks)
+    one_by_one(monkeypatch)
+    single, same = prepare(case, mesh, ranks)
+    assert 0 < scheme.active.live.size < 0.6 * len(mesh.points)
+    np.testing.assert_array_equal(scheme.active.live, single.active.live)
+    rate, exact = rates_of(scheme, state), rates_of(single, same)
+    np.testing.assert_allclose(rate, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
 def test_more_contacts_than_there_was_room_for(ranks: Ranks) -> None:
     """Nothing of them is lost: forces are the same when there is ample room from the start."""
     case = grains(2, {}, {})

@@ -12,6 +12,7 @@ from frit.solver import active, kernels
 from frit.solver.arrays import Floats
 from frit.solver.case import Case, parse_case
 from frit.solver.geometry import Mesh
+from frit.solver.observe import free_energy
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
 from frit.solver.scheme import Scheme
@@ -430,14 +431,6 @@ def test_choosing_again_from_the_same_state_gives_the_same(ranks: Ranks) -> None
 # --- the equations descend the free energy
 
 
-def free_energy(scheme: Scheme, u: Floats) -> float:
-    d = scheme.d
-    table = d.shape
-    return float(
-        kernels.free_energy(u, d.weights, d.dim, table.offsets, table.nodes, table.rows, table.table, d.coefficients)
-    )
-
-
 @pytest.mark.parametrize("dim", [2, 3])
 def test_free_energy_agrees_with_the_reference(ranks: Ranks, dim: int) -> None:
     """One sum over the points in another order."""
@@ -446,7 +439,24 @@ def test_free_energy_agrees_with_the_reference(ranks: Ranks, dim: int) -> None:
     scheme, state = prepare(case, mesh, ranks)
     disturb(state, 3)
     exact = reference.free_energy(state.u[:, 0], state.u[:, 1:4], *dense(scheme), mesh.weights, case.model)
-    assert free_energy(scheme, state.u) == pytest.approx(exact, rel=1e-13)
+    assert free_energy(scheme.d, state.u) == pytest.approx(exact, rel=1e-13)
+
+
+def test_free_energy_of_more_particles_than_a_word_has_bits(ranks: Ranks) -> None:
+    """72 discs with a column each, also in blocks that see fewer of them than there are."""
+    centres = [[1.7 + 3.4 * i, 1.6 + 3.3 * j] for i in range(9) for j in range(8)]
+    case = parse_case({
+        "domain": {"size": [30.6, 26.5]},
+        "nodes": {"spacing": 0.85},
+        "particles": {"centres": centres, "radii": [1.5] * 72, "interface_width": 0.5},
+        "time": {"end": 1.0},
+        "activation": FULL,
+    })  # fmt: skip
+    mesh = build_mesh(case, ranks)
+    scheme, state = prepare(case, mesh, ranks)
+    exact = reference.free_energy(state.u[:, 0], state.u[:, 1:73], *dense(scheme), mesh.weights, case.model)
+    assert len(scheme.d.blocks.points) > 100
+    assert free_energy(scheme.d, state.u) == pytest.approx(exact, rel=1e-13)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -465,7 +475,7 @@ def test_potentials_are_the_slopes_of_the_free_energy(ranks: Ranks, dim: int) ->
             for k in (-2, -1, 1, 2):
                 moved = state.u.copy()
                 moved[node, column] += k * h
-                F.append(free_energy(scheme, moved))
+                F.append(free_energy(scheme.d, moved))
             assert (8 * (F[2] - F[1]) - (F[3] - F[0])) / (12 * h) == pytest.approx(exact, rel=1e-9, abs=1e-10)
 
 
@@ -484,6 +494,6 @@ def test_free_energy_falls(ranks: Ranks, dim: int) -> None:
     gained = (m * scheme.W) @ rate[:, 0] - (m @ rate[:, 1:4] ** 2).sum() / L
     assert gained == pytest.approx(-lost, rel=1e-12)
     assert lost > 1.0
-    before, dt = free_energy(scheme, state.u), 1e-6
-    after = free_energy(scheme, state.u + dt * rate)
+    before, dt = free_energy(scheme.d, state.u), 1e-6
+    after = free_energy(scheme.d, state.u + dt * rate)
     assert (after - before) / dt == pytest.approx(-lost, rel=1e-2)  # up to dt times the stiffest part, 120 to 1000

@@ -131,15 +131,18 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers
     flags = np.zeros(points, dtype=np.int32)
     owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
     clash = np.full((points, 2), -1, dtype=np.int64)
+    owners = np.empty((2, 0, 0))
     changed = np.ones(d.nodes, dtype=bool)  # nodes whose values or owners a point has not been asked about yet
     while True:
-        _sense(d, state, flags, owner, clash, changed)
+        if owners.shape[1] != owner.shape[1]:
+            owners = np.empty((2, owner.shape[1], d.nodes + LANES))
+        _sense(d, state, flags, owner, clash, changed, owners)
         if not d.case.activation.enabled:
             flags[:] = 1
         if not d.case.activation.few_order_parameters:
             owner[:] = np.arange(owner.shape[1], dtype=np.int32)
             return flags, owner, None
-        claims, clashes = _claim(d, owner, clash)
+        claims, clashes = _claim(d, owner, clash, owners)
         clashes = _everyones_pairs(d, clashes)
         meet, fewer = None, False
         if compact and state.u.shape[1] > LANES:
@@ -171,11 +174,14 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers
             owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
 
 
-def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers, Integers]:
-    """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot."""
+def _claim(d: Discretisation, owner: Numbers, clash: Integers, owners: Floats) -> tuple[Numbers, Integers]:
+    """The owners of the nodes' slots, with one ring of room, and the pairs of particles that want the same slot.
+
+    owners: work space, as for `_sense`.
+    """
     near, blocks, table = d.nearest, d.blocks, d.shape
-    high = np.full((owner.shape[1], d.nodes + LANES), -1.0)
-    low = np.full_like(high, block_kernels.NOBODY)
+    high, low = owners
+    high[:], low[:] = -1.0, block_kernels.NOBODY
     block_kernels.claim(
         high, low, owner, blocks.points, blocks.begin, table.nodes, near.kind, near.starts, near.places
     )
@@ -190,8 +196,13 @@ def _claim(d: Discretisation, owner: Numbers, clash: Integers) -> tuple[Numbers,
     return claims, np.concatenate([clash, np.stack([lowest[crowded], claims[crowded]], axis=1)])
 
 
-def _sense(d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers, changed: Flags) -> None:
-    """Fill flags, owner and clash at the points that see a changed node; see `kernels.sense`."""
+def _sense(
+    d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers, changed: Flags, owners: Floats
+) -> None:
+    """Fill flags, owner and clash at the points that see a changed node; see `kernels.sense`.
+
+    owners (2, slots, n + LANES) is work space, for the largest and the smallest particle of each slot and node.
+    """
     table, near, blocks, switch = d.shape, d.nearest, d.blocks, d.case.activation
     least = LEAST * switch.eps_eta
     kernels.sense(
@@ -200,8 +211,8 @@ def _sense(d: Discretisation, state: State, flags: Numbers, owner: Numbers, clas
     )
     columns = np.zeros((state.u.shape[1], d.nodes + LANES))
     block_kernels.to_columns(columns, state.u, np.arange(d.nodes))
-    high = np.full((owner.shape[1], d.nodes + LANES), -1.0)
-    low = np.full_like(high, block_kernels.NOBODY)
+    high, low = owners
+    high[:], low[:] = -1.0, block_kernels.NOBODY
     block_kernels.by_column(high, low, state.owner)
     # |sum N u| and |sum grad N u| are at most max |u| times the largest sum of |N| or of |grad N| in a row of the table
     negligible = min(least, switch.eps_eta) / d.steepest

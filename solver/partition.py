@@ -103,13 +103,13 @@ class Halo:
     def __init__(self, ranks: Ranks, size: int, neighbours: list[tuple[int, Integers]]) -> None:
         """neighbours: other ranks, and where their values belong here, in the same order there."""
         self.ranks, self.neighbours = ranks, neighbours
-        self.owned = np.ones(size, dtype=bool)
+        self.owned, holders = np.ones(size, dtype=bool), np.zeros(size, dtype=np.int32)
         for rank, common in neighbours:
+            holders[common] += 1
             if rank < ranks.rank:
                 self.owned[common] = False
-        shared = [common for _, common in neighbours]
-        self.shared = np.unique(np.concatenate(shared)) if shared else np.empty(0, dtype=np.int64)
-        self.in_pairs = sum(common.size for common in shared) == self.shared.size  # no place has three holders
+        self.shared = np.flatnonzero(holders)
+        self.in_pairs = bool((holders <= 1).all())  # no place has three holders
 
     @classmethod
     def of_nodes(cls, ranks: Ranks, nodes: Integers) -> "Halo":

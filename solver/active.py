@@ -12,6 +12,7 @@ import numpy as np
 
 from . import block_kernels, kernels, slots, unknowns
 from .arrays import Array, Flags, Floats, Integers, Numbers
+from .block_kernels import SMALLEST
 from .blocks import LiveBlocks, live_blocks
 from .discretisation import FIXED_WORK, WORTH, Discretisation
 from .rigid import rotations
@@ -28,8 +29,9 @@ class Active:
     """The live points and their surroundings at one moment; arrays over this rank's points and nodes."""
 
     live: Integers  # numbers of the live points
-    blocks: LiveBlocks  # those of them that are in blocks
-    loose: Integers  # (L,) numbers of those that are not, the first `loose_border` of them at the border of the rank
+    blocks: LiveBlocks  # those of them that are in blocks along x
+    upright: LiveBlocks  # those that are in blocks along y
+    loose: Integers  # (L,) numbers of those that are in neither, the first `loose_border` at the rank's border
     loose_border: int
     owner: Numbers  # (L, slots) particle of each slot at the loose points, -1: none
     mask: Floats  # (L, F) 1 for rho and the slots that exist at the loose points, else 0
@@ -51,7 +53,7 @@ class Active:
 
         A loose point takes twice that for each pack: its sums wait for each other, and fields that are not there count.
         """
-        blocks = FIXED_WORK * self.blocks.blocks.size + self.blocks.column.size
+        blocks = sum(FIXED_WORK * live.blocks.size + live.column.size for live in (self.blocks, self.upright))
         return float(blocks + 2.0 * (FIXED_WORK * self.loose.size + self.present.sum()))
 
     def stale(self, u: Floats) -> float:
@@ -76,16 +78,16 @@ def activate(d: Discretisation, state: State) -> Active:
     _spread(d, low, high)
     kernels.switch_on(flags, low < high, table.offsets, table.nodes)
     live = np.flatnonzero(flags)
-    loose = d.blocks.loose[flags[d.blocks.loose] != 0]
+    loose = d.upright.loose[flags[d.upright.loose] != 0]
     mask = np.zeros((loose.size, state.u.shape[1]))
     mask[:, 0] = 1.0
     mask[:, 1 : 1 + owner.shape[1]] = owner[loose] >= 0
     moving, resting = _touched(d, flags != 0), _touched(d, flags == 0)
     edge_nodes = np.flatnonzero(moving & resting & (high >= 0))
     potential, drift = _still_shares(d, state, flags, owner, edge_nodes, high)
-    blocks = live_blocks(d.blocks, flags, owner, d.weights)
+    blocks, upright = (live_blocks(some, flags, owner, d.weights) for some in (d.blocks, d.upright))
     kind = np.where(d.share.halo.owned, unknowns.OWNED, 0)
-    kind[:] |= unknowns.BLOCKS if blocks.blocks.size else 0
+    kind |= unknowns.BLOCKS if blocks.blocks.size or upright.blocks.size else 0
     kind[_seen_by(d, loose)] |= unknowns.LOOSE
     kind[edge_nodes] |= unknowns.LOOSE
     moved, rest = (unknowns.lay_out(np.flatnonzero(s), state.owner, kind, d.share.halo) for s in (moving, ~moving))
@@ -94,8 +96,9 @@ def activate(d: Discretisation, state: State) -> Active:
     return Active(
         live=live,
         blocks=blocks,
+        upright=upright,
         loose=loose,
-        loose_border=int((flags[d.blocks.loose[: d.blocks.loose_border]] != 0).sum()),
+        loose_border=int((flags[d.upright.loose[: d.upright.loose_border]] != 0).sum()),
         owner=owner[loose],
         mask=mask,
         present=(mask != 0.0).reshape(loose.size, mask.shape[1] // LANES, LANES).any(axis=2),
@@ -245,8 +248,8 @@ def _watch(d: Discretisation, flags: Numbers, owner: Numbers, node_owner: Number
     )
     column = np.repeat(moved.strips.column, np.diff(moved.strips.first))
     bits = watch[moved.nodes]
-    alone = np.where(bits >> column & 1, 1.0 / (SLOT_EPS * switch.eps_eta), 0.0)
-    return np.where(bits & 1, 1.0 / np.where(column == 0, switch.eps_rho, switch.eps_eta), alone)
+    slot, rho, eta = (1.0 / max(x, SMALLEST) for x in (SLOT_EPS * switch.eps_eta, switch.eps_rho, switch.eps_eta))
+    return np.where(bits & 1, np.where(column == 0, rho, eta), np.where(bits >> column & 1, slot, 0.0))
 
 
 def _seen_by(d: Discretisation, chosen: Integers) -> Flags:

@@ -142,8 +142,8 @@ def potential(
 ) -> int:
     """First half of an evaluation, as `kernels.potential`: fields, D and S2 of live blocks low ... high - 1.
 
-    W (1, n + LANES) gets their shares. touching gets -1 - (LANES l + j) for lane j of block l where particles may
-    touch; returned: `touches` and those.
+    W (1, n + LANES) gets their shares. touching gets LANES l + j for lane j of block l where particles may touch;
+    returned: `touches` and those.
     """
     mode = flush_denormals()
     width = table.shape[0]
@@ -194,7 +194,7 @@ def potential(
             store(overlaps, 0, 0, overlap)
             for j in range(LANES):
                 if overlaps[0, j] > m.c and live_weights[l, j] > 0.0:
-                    touching[touches] = -1 - (LANES * l + j)
+                    touching[touches] = LANES * l + j
                     touches += 1
     restore_denormals(mode)
     return touches
@@ -208,11 +208,9 @@ def meet(
 ) -> int:
     """`kernels.meet` for the points in blocks."""
     width = 1 + dim
-    for code in touching:
-        if code >= 0:  # a loose point
-            continue
-        l = (-1 - code) // LANES
-        j = (-1 - code) % LANES
+    for lane in touching:
+        l = lane // LANES
+        j = lane % LANES
         for e in range(first[l] + 1, first[l + 1]):
             if owner[e, j] < 0 or fields[e * width, j] <= 0.0:
                 continue
@@ -231,6 +229,23 @@ def meet(
                 share[r] = weights[where[r]] * touching_share(contacts, r, weights[where[r]], dim, c)
                 count += share[r] > 0.0
     return count
+
+
+@jit
+def fetch(columns: Floats, source: Floats, at: Integers) -> None:
+    """columns[c, i] = source[c, at[i]]."""
+    for c in range(columns.shape[0]):
+        for i in range(at.size):
+            columns[c, i] = source[c, at[i]]
+
+
+@jit
+def give(target: Floats, columns: Floats, at: Integers) -> None:
+    """target[c, at[i]] += columns[c, i], and columns[c, i] = 0."""
+    for c in range(columns.shape[0]):
+        for i in range(at.size):
+            target[c, at[i]] += columns[c, i]
+            columns[c, i] = 0.0
 
 
 @jit

@@ -3,10 +3,13 @@
 Points of one lattice row have the same shape functions, and where nodes are numbered along x the next point sees the
 next nodes. Eight such points make a block, one lane of a pack each: an entry of the table then serves all eight, and a
 field's values at their eight nodes lie side by side. What a block costs depends on the fields that exist there, not on
-the columns that all particles of the case need. Points without such neighbours (at walls, on other meshes) are loose.
+the columns that all particles of the case need.
+
+Near the walls at the ends of x points have no such neighbours, but along y they do: `find_upright` numbers the nodes
+that they see along y, for blocks of their own. Points without either (in corners, on other meshes) are loose.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +18,7 @@ from .jit import jit
 from .shape import ShapeTable
 from .simd import LANES
 
+NONE = np.empty(0, dtype=np.int64)
 MIXED = -2  # in `LiveBlocks.particle`: not one particle in all lanes
 
 
@@ -23,11 +27,13 @@ class Blocks:
     """Lane j of block b is points[b, j], -1: nothing is there. The first lane's nodes are nodes[begin[b] + i]."""
 
     points: Numbers  # (b, LANES)
-    begin: Integers  # (b,) into the nodes of the shape table
+    begin: Integers  # (b,) into `nodes`
     count: Integers  # (b,) of them
     start: Integers  # (b,) column of the shape table
     x: Floats  # (3 b, LANES) row 3 b + k: component k of the points' places, 0 along an axis that is not there
     border: Flags  # (b,) whether its points see a node that another rank holds, too
+    nodes: Numbers  # those of the shape table; where `at` is not empty, their places in it
+    at: Integers  # the nodes that the points see, one after the other along y; empty: all nodes in their own order
     loose: Integers  # points in no block, those that see such a node first
     loose_border: int  # how many of them do
 
@@ -51,39 +57,92 @@ class LiveBlocks:
 
 
 def find_blocks(table: ShapeTable, x: Floats, shared: Flags) -> Blocks:
-    """The blocks of a rank's points at x (p, dim), in the order of their first points; shared (n,): nodes of others."""
-    if table.points == 0:
-        none, no = np.empty(0, dtype=np.int64), np.empty(0, dtype=bool)
-        return Blocks(np.empty((0, LANES), np.int32), none, none, none, np.empty((0, LANES)), no, none, 0)
-    order = np.lexsort((table.nodes[table.offsets[:-1]], table.rows)).astype(np.int64)
-    place = np.empty(table.points, dtype=np.int64)
-    number_rows(place, order, table.offsets, table.nodes, table.rows)
+    """The blocks of a rank's points at x (p, dim) along x; shared (n,): nodes that other ranks hold, too."""
+    border = np.zeros(table.points, dtype=bool)
+    see(border, shared, table.offsets, table.nodes)
+    return _group(np.arange(table.points), table.offsets, table.nodes, table.rows, x, border, NONE)
+
+
+def find_upright(table: ShapeTable, x: Floats, positions: Floats, shared: Flags, along: Blocks) -> Blocks:
+    """The blocks along y of the points that are loose in those along x; positions (n, dim) of the nodes."""
+    chosen = np.sort(along.loose)
+    offsets = np.append(0, np.cumsum(table.offsets[chosen + 1] - table.offsets[chosen]))
+    nodes = np.empty(int(offsets[-1]), dtype=np.int32)
+    copy_lists(nodes, offsets, chosen, table.offsets, table.nodes)
+    seen = np.zeros(len(positions), dtype=bool)
+    seen[nodes] = True
+    at = np.flatnonzero(seen)
+    at = at[np.lexsort(_up(positions[at], _period(x[chosen], table.rows[chosen])))]
+    number = np.full(len(positions), -1, dtype=np.int32)
+    number[at] = np.arange(at.size)
+    border = np.zeros(chosen.size, dtype=bool)
+    see(border, shared, offsets, nodes)
+    found = _group(chosen, offsets, number[nodes], table.rows[chosen], x, border, at)
+    begin = np.append(0, np.cumsum(found.count))
+    kept = np.empty(int(begin[-1]), dtype=np.int32)
+    copy_lists(kept, begin, np.arange(found.begin.size), found.begin, found.nodes)
+    return replace(found, nodes=kept, begin=begin[:-1])
+
+
+def _period(x: Floats, rows: Integers) -> float:
+    """The distance along y at which points at x (p, dim) of the same row of the table repeat."""
+    across = np.round(np.delete(x, 1, axis=1), 6)  # what is equal may differ by round-off
+    order = np.lexsort((x[:, 1], *across.T, rows))
+    same = (rows[order[1:]] == rows[order[:-1]]) & (across[order[1:]] == across[order[:-1]]).all(axis=1)
+    return float(np.diff(x[order, 1])[same].min(initial=np.inf))
+
+
+def _up(positions: Floats, period: float) -> tuple[Floats, ...]:
+    """Keys, the first one last, that bring nodes a period apart along y next to each other."""
+    across = np.round(np.delete(positions, 1, axis=1), 6)
+    phase = np.round(positions[:, 1] / period % 1.0, 4) % 1.0
+    return positions[:, 1], phase, *across.T
+
+
+def _group(
+    chosen: Integers, offsets: Integers, nodes: Numbers, rows: Integers, x: Floats, border: Flags, at: Integers
+) -> Blocks:
+    """The blocks of the chosen points, in the order of their first; offsets, rows and border have an entry for each."""
+    if chosen.size == 0:
+        no = np.empty(0, dtype=bool)
+        return Blocks(np.empty((0, LANES), np.int32), NONE, NONE, NONE, np.empty((0, LANES)), no, nodes, at, NONE, 0)
+    order = np.lexsort((nodes[offsets[:-1]], rows)).astype(np.int64)
+    place = np.empty(chosen.size, dtype=np.int64)
+    number_rows(place, order, offsets, nodes, rows)
     ends = np.flatnonzero(np.append(place[1:] % LANES == 0, True))
     starts = np.append(0, ends[:-1] + 1)
     keep = ends > starts  # a block with one point gains nothing
     starts, lengths = starts[keep], (ends - starts)[keep] + 1
     lanes = starts[:, None] + np.arange(LANES)
     inside = np.arange(LANES) < lengths[:, None]
-    points = np.where(inside, order[np.minimum(lanes, order.size - 1)], -1).astype(np.int32)
-    points = points[np.argsort(points[:, 0], kind="stable")]
-    blocked = np.zeros(table.points, dtype=bool)
-    blocked[points[points >= 0]] = True
-    first = points[:, 0].astype(np.int64)
-    border = np.zeros(table.points, dtype=bool)
-    see(border, shared, table.offsets, table.nodes)
-    loose = np.flatnonzero(~blocked)
+    lanes = np.where(inside, order[np.minimum(lanes, order.size - 1)], -1)
+    lanes = lanes[np.argsort(lanes[:, 0], kind="stable")]
+    blocked = np.zeros(chosen.size, dtype=bool)
+    blocked[lanes[lanes >= 0]] = True
+    first = lanes[:, 0]
+    points = np.where(lanes >= 0, chosen[lanes], -1).astype(np.int32)
     places = np.zeros((len(points), 3, LANES))
     places[:, : x.shape[1]] = np.where((points >= 0)[:, None], x[points].transpose(0, 2, 1), 0.0)
     return Blocks(
         points,
-        table.offsets[first],
-        table.offsets[first + 1] - table.offsets[first],
-        table.rows[first],
+        offsets[first],
+        offsets[first + 1] - offsets[first],
+        rows[first],
         places.reshape(-1, LANES),
-        np.asarray((border[points] & (points >= 0)).any(axis=1)),
-        np.concatenate([loose[border[loose]], loose[~border[loose]]]),
-        int(border[loose].sum()),
+        np.asarray((border[lanes] & (lanes >= 0)).any(axis=1)),
+        nodes,
+        at,
+        np.concatenate([chosen[~blocked & border], chosen[~blocked & ~border]]),
+        int((~blocked & border).sum()),
     )
+
+
+@jit
+def copy_lists(result: Numbers, begin: Integers, chosen: Integers, offsets: Integers, nodes: Numbers) -> None:
+    """result[begin[i]] ... become the nodes of point chosen[i]."""
+    for i in range(chosen.size):
+        for k in range(begin[i + 1] - begin[i]):
+            result[begin[i] + k] = nodes[offsets[chosen[i]] + k]
 
 
 @jit

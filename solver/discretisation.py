@@ -6,7 +6,7 @@ import numpy as np
 
 from . import kernels
 from .arrays import Flags, Floats, Numbers
-from .blocks import Blocks, find_blocks
+from .blocks import Blocks, find_blocks, find_upright
 from .case import Case
 from .energy import Coefficients
 from .geometry import Mesh
@@ -29,7 +29,8 @@ class Discretisation:
     case: Case
     share: Share
     shape: ShapeTable
-    blocks: Blocks
+    blocks: Blocks  # along x
+    upright: Blocks  # along y, of points in none of those
     nearest: Nearest
     steepest: float  # the largest of sum_a |N_a| = 1 and sum_a |grad N_a| at any point of any rank, 1/nm
     positions: Floats  # (n, dim) of this rank's nodes, nm
@@ -90,8 +91,10 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     _check_mass(mesh, share, mass)
     positions = mesh.nodes[nodes]
     at_wall = np.asarray((np.minimum(positions, size - positions) <= mesh.spacing.max()).any(axis=1))
+    blocks = find_blocks(table, x, shared)
+    upright = find_upright(table, x, positions, shared, blocks)
     return Discretisation(
-        case, share, table, find_blocks(table, x, shared), nearest(table, NEAR), steepest(table, ranks),
+        case, share, table, blocks, upright, nearest(table, NEAR), steepest(table, ranks),
         positions, at_wall, x, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )

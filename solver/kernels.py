@@ -215,8 +215,6 @@ def meet(
     fields that `potential` left in `point`.
     """
     for l in touching:
-        if l < 0:  # in a block
-            continue
         row = l * (1 + dim)
         for s in range(owner.shape[1]):
             if owner[l, s] < 0 or point[row, 1 + s] <= 0.0:

@@ -5,15 +5,14 @@ the particles sit where their forces vanish, and then follow diffusion. `Relaxat
 speed at which they get there.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
-from .arrays import Floats, Integers
+from .arrays import Floats
+from .elimination import Factors, Plan, factors
 from .energy import Coefficients
+from .jit import jit
 
 SMALLEST_VOLUME = 1e-3  # nm^dim: a particle that has been consumed has no velocity
 
@@ -23,20 +22,6 @@ def rotations(dim: int) -> int:
     return 1 if dim == 2 else 3
 
 
-def cross(omega: Floats, r: Floats) -> Floats:
-    """omega x r per row; in the plane omega (n, 1) points out of it."""
-    if r.shape[1] == 2:
-        return np.stack([-omega[:, 0] * r[:, 1], omega[:, 0] * r[:, 0]], axis=1)
-    return np.cross(omega, r)
-
-
-def torque(r: Floats, F: Floats) -> Floats:
-    """r x F per row: (n, 1) in the plane, (n, 3) in space."""
-    if r.shape[1] == 2:
-        return (r[:, 0] * F[:, 1] - r[:, 1] * F[:, 0])[:, None]
-    return np.cross(r, F)
-
-
 def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
     """The rigid motion (v, omega) of every particle, v taken at the origin: V_a(r) = v + omega x r.
 
@@ -44,12 +29,36 @@ def velocities(forces: Floats, moments: Floats, m: Coefficients) -> Floats:
     and int r eta_a. With r_a = int r eta_a / V_a and T_a = int (r - r_a) x b_a,
     V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a; the paper's v_a is V_a(r) eta_a.
     """
+    motion = np.empty(forces.shape)
+    move(motion, forces, moments, m)
+    return motion
+
+
+@jit
+def move(motion: Floats, forces: Floats, moments: Floats, m: Coefficients) -> None:
+    """The loop of `velocities`."""
     dim = moments.shape[1] - 1
-    volume = np.where(moments[:, :1] > SMALLEST_VOLUME, moments[:, :1], np.inf)
-    centre = moments[:, 1:] / volume
-    F = forces[:, :dim]
-    omega = m.m_r * (forces[:, dim:] - torque(centre, F)) / volume
-    return np.hstack([m.m_t * F / volume - cross(omega, centre), omega])
+    for a in range(len(moments)):
+        volume = moments[a, 0] if moments[a, 0] > SMALLEST_VOLUME else np.inf
+        turn, push = m.m_r / volume, m.m_t / volume
+        x, y = moments[a, 1] / volume, moments[a, 2] / volume
+        F_x, F_y = forces[a, 0], forces[a, 1]
+        if dim == 2:
+            spin = turn * (forces[a, 2] - (x * F_y - y * F_x))
+            motion[a, 0] = push * F_x + spin * y
+            motion[a, 1] = push * F_y - spin * x
+            motion[a, 2] = spin
+            continue
+        z, F_z = moments[a, 3] / volume, forces[a, 2]
+        spin_x = turn * (forces[a, 3] - (y * F_z - z * F_y))
+        spin_y = turn * (forces[a, 4] - (z * F_x - x * F_z))
+        spin_z = turn * (forces[a, 5] - (x * F_y - y * F_x))
+        motion[a, 0] = push * F_x - (spin_y * z - spin_z * y)
+        motion[a, 1] = push * F_y - (spin_z * x - spin_x * z)
+        motion[a, 2] = push * F_z - (spin_x * y - spin_y * x)
+        motion[a, 3] = spin_x
+        motion[a, 4] = spin_y
+        motion[a, 5] = spin_z
 
 
 def in_space(motion: Floats) -> Floats:
@@ -73,41 +82,23 @@ class Relaxation:
     """
 
     carried: Floats  # V_0 (particles, dim + rotations)
-    solve: Callable[[Floats], Floats]
+    system: Factors
 
     def __call__(self, free: Floats) -> Floats:
         """V_tau for the free motion V."""
-        return self.carried + self.solve((free - self.carried).ravel()).reshape(free.shape)
-
-
-class Pattern:
-    """Where the entries of I + tau M S lie in a sparse matrix by columns, for the pairs (pairs, 2) that may touch."""
-
-    def __init__(self, pairs: Integers, particles: int, size: int) -> None:
-        """size: degrees of freedom of a particle."""
-        a, b = pairs[:, 0], pairs[:, 1]
-        self.block_rows, block_columns = np.concatenate([a, a, b, b]), np.concatenate([a, b, a, b])
-        self.count = count = particles * size
-        each, diagonal = np.arange(size), np.arange(count)
-        rows = self.block_rows[:, None, None] * size + each[:, None]
-        columns = block_columns[:, None, None] * size + each
-        codes = np.concatenate([(columns * count + rows).ravel(), diagonal * (count + 1)])
-        found, self.place = np.unique(codes, return_inverse=True)  # of each value in the matrix; the diagonal last
-        self.indices = (found % count).astype(np.int32)
-        self.starts = np.searchsorted(found, np.arange(count + 1) * count).astype(np.int32)
-
-    def matrix(self, blocks: Floats) -> csc_array:
-        """I + the blocks (4 pairs, size, size) of the pairs' rows and columns (a, a), (a, b), (b, a), (b, b)."""
-        values = np.concatenate([blocks.ravel(), np.ones(self.count)])
-        return csc_array((np.bincount(self.place, values), self.indices, self.starts), shape=(self.count, self.count))
+        return self.carried + self.system.solve(free - self.carried)
 
 
 def relaxation(
-    stiffness: Floats, pattern: Pattern, moments: Floats, m: Coefficients, tau: float, carried: Floats
+    stiffness: Floats, order: Plan, moments: Floats, m: Coefficients, tau: float, carried: Floats
 ) -> Relaxation:
     """The relaxation for a stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over ranks."""
     particles, size = len(moments), stiffness.shape[2]
-    units = np.broadcast_to(np.eye(size)[:, None, :], (size, particles, size))
-    M = np.stack([velocities(unit, moments, m) for unit in units], axis=2)
-    S = np.concatenate([stiffness[:, 0], stiffness[:, 1], -stiffness[:, 0], -stiffness[:, 1]])
-    return Relaxation(carried, splu(pattern.matrix(tau * (M[pattern.block_rows] @ S))).solve)
+    M = np.empty((particles, size, size))
+    for k in range(size):
+        unit = np.zeros((particles, size))
+        unit[:, k] = 1.0
+        M[:, :, k] = velocities(unit, moments, m)
+    first, second = M[order.pairs[:, 0]], M[order.pairs[:, 1]]
+    a, b = stiffness[:, 0], stiffness[:, 1]
+    return Relaxation(carried, factors(order, tau * np.concatenate([first @ a, first @ b, -second @ a, -second @ b])))

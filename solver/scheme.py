@@ -6,13 +6,15 @@ Nodes carry rho and eta, material points only integrate (Huang et al. 2023, sect
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from . import block_kernels, kernels, rigid, unknowns
+from . import block_kernels, elimination, kernels, rigid, unknowns
 from .active import Active, activate
 from .arrays import Floats
 from .discretisation import Discretisation
+from .layers import Layer
 from .simd import LANES
 from .state import State
 
@@ -36,7 +38,7 @@ class Scheme:
             # What is chosen from; a resumed run chooses from it again, and comes to the same.
             self.before = replace(state, u=state.u.copy(), owner=state.owner.copy(), slot_of=state.slot_of.copy())
             if hasattr(self, "active"):
-                del self.active  # hundreds of bytes per point, in the way of the next
+                del self.active, self.layers, self.main  # hundreds of bytes per point, in the way of the next
             self._activate(state)
 
     def _activate(self, state: State) -> None:
@@ -44,18 +46,19 @@ class Scheme:
         d, a, columns = self.d, self.active, state.u.shape[1]
         self.slot_of = state.slot_of
 
-        # Nodes: W; fields, and rates (0 between evaluations), by columns for blocks and by rows for loose points
-        self.u_columns, self.rate_columns = np.zeros((2, columns, d.nodes + LANES))
-        self.u_rows, self.rate_rows = np.zeros((2, d.nodes, columns))
-        self.W_row = np.zeros((1, d.nodes + LANES))
-        self.W = self.W_row[0, : d.nodes]
+        # Blocks, and the nodes' fields, rates and W by columns
+        self.layers = [
+            Layer(d, blocks, live, columns, partial(self._room, name, columns=LANES))
+            for name, blocks, live in (("along", d.blocks, a.blocks), ("upright", d.upright, a.upright))
+        ]
+        self.main = self.layers[0]
+        self.W = self.main.W[0, : d.nodes]
 
-        # Points: fields, D and S2, loose and in blocks
+        # Loose points: their fields, D and S2; the nodes' fields, and rates (0 between evaluations), by rows
         self.D, self.S2 = np.empty((2, a.loose.size))
         self.point = self._room("point", a.loose.size * (1 + d.dim), columns)
-        self.D_blocks, self.S2_blocks = np.empty((2, a.blocks.blocks.size, LANES))
-        self.fields = self._room("fields", a.blocks.column.size * (1 + d.dim), LANES)
-        self.touching = np.empty(a.live.size, dtype=np.int64)
+        self.u_rows, self.rate_rows = np.zeros((2, d.nodes, columns))
+        self.touching = np.empty(a.loose.size, dtype=np.int64)
         self.work = np.empty((1, d.shape.longest))
         self.velocity = np.zeros((d.dim, columns))
 
@@ -63,7 +66,7 @@ class Scheme:
         size = self.motion.shape[1]
         self.sums = np.zeros((self.particles, size + 1 + d.dim))
         self.forces, self.moments = self.sums[:, :size], self.sums[:, size:]
-        self.pattern = rigid.Pattern(a.pairs, self.particles, size)
+        self.order = elimination.plan(a.pairs, self.particles)
         self.carried = self.motion
 
     def _room(self, name: str, rows: int, columns: int) -> Floats:
@@ -96,7 +99,7 @@ class Scheme:
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
                 self.carried = self.motion
-                self.relax = rigid.relaxation(self._stiffness(), self.pattern, moments, m, tau, self.carried)
+                self.relax = rigid.relaxation(self._stiffness(), self.order, moments, m, tau, self.carried)
             self.motion = self.relax(free)
 
         # Fluxes (20), (21)
@@ -126,79 +129,76 @@ class Scheme:
     def _gather(self, y: Floats) -> None:
         """Fields and D of this rank's points in the work arrays, and W summed over the ranks."""
         d, a = self.d, self.active
+        unknowns.spread(self.main.u, self.u_rows, y, a.unknowns.strips)
+        for layer in self.layers:
+            block_kernels.fetch(layer.u, self.main.u, layer.at)
+            layer.W[:] = 0.0
         kernels.start(self.W, a.potential, a.nodes)
-        unknowns.spread(self.u_columns, self.u_rows, y, a.unknowns.strips)
-        self.touches = 0
-        self._potential((0, a.loose_border), (0, a.blocks.border))
+        self._potential(border=True)
         under_way = d.share.halo.start(self.W)  # what goes to shared nodes is complete; the rest is done meanwhile
-        self._potential((a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
+        self._potential(border=False)
         d.share.halo.finish(self.W, under_way)
 
-    def _potential(self, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
-        """The part of `_gather` for some of the loose points and blocks."""
+    def _potential(self, border: bool) -> None:
+        """The part of `_gather` for the points at the border of the rank, or for the others."""
         d, a, table = self.d, self.active, self.d.shape
-        if loose[0] < loose[1]:
-            self.touches = kernels.potential(
-                self.W, self.touching, self.point, self.D, self.S2, self.u_rows, a.loose, a.mask, a.present, a.several,
-                d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
-                *loose, self.touches,
-            )
-        if blocks[0] < blocks[1]:
-            self.touches = block_kernels.potential(
-                self.W_row, self.touching, self.fields, self.D_blocks, self.S2_blocks, self.u_columns,
-                a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.owner, a.blocks.partial,
-                d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table, d.coefficients,
-                *blocks, self.touches,
-            )
+        self.touches = kernels.potential(
+            self.W, self.touching, self.point, self.D, self.S2, self.u_rows, a.loose, a.mask, a.present, a.several,
+            d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
+            *self._range(border), 0 if border else self.touches,
+        )
+        for layer in self.layers:
+            layer.potential(border)
+            block_kernels.give(self.main.W, layer.W, layer.at)
 
     def _scatter(self, rate: Floats) -> None:
         """Sources and fluxes of all points in rate, after `_gather` and once the motion is known."""
         d, a = self.d, self.active
+        for layer in self.layers:
+            block_kernels.fetch(layer.W, self.main.W, layer.at)
         if d.case.model.rigid_motion:
             kernels.add_still_drift(
                 self.rate_rows, a.drift, a.edge_nodes, a.edge_particle, self.slot_of, self.motion
             )
         motion = rigid.in_space(self.motion)
-        sums, strips = (self.rate_columns, self.rate_rows, d.mass), a.unknowns.strips
-        self._divergence(motion, (0, a.loose_border), (0, a.blocks.border))
+        sums, strips = (self.main.rate, self.rate_rows, d.mass), a.unknowns.strips
+        self._divergence(motion, border=True)
         unknowns.collect(rate, *sums, strips, 0, a.unknowns.shared)
         under_way = a.unknowns.halo.start(rate)
-        self._divergence(motion, (a.loose_border, a.loose.size), (a.blocks.border, a.blocks.blocks.size))
+        self._divergence(motion, border=False)
         unknowns.collect(rate, *sums, strips, a.unknowns.shared, strips.node.size)
         a.unknowns.halo.finish(rate, under_way)
 
-    def _divergence(self, motion: Floats, loose: tuple[int, int], blocks: tuple[int, int]) -> None:
-        """The part of `_scatter` for some of the loose points and blocks, before the 1/m_a."""
+    def _divergence(self, motion: Floats, border: bool) -> None:
+        """The part of `_scatter` for the points at the border of the rank, or for the others; before the 1/m_a."""
         d, a, table = self.d, self.active, self.d.shape
-        moving = d.case.model.rigid_motion
-        if loose[0] < loose[1]:
-            kernels.divergence(
-                self.rate_rows, self.point, self.D, self.S2, self.W, motion, self.velocity,
-                a.loose, a.owner, a.present, d.weights, d.x,
-                table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, moving, d.huang, *loose,
-            )
-        if blocks[0] < blocks[1]:
-            block_kernels.divergence(
-                self.rate_columns, self.fields, self.D_blocks, self.S2_blocks, self.W_row, motion,
-                a.blocks.blocks, a.blocks.weights, a.blocks.first, a.blocks.column, a.blocks.particle, a.blocks.owner,
-                d.blocks.x, d.blocks.begin, d.blocks.count, d.blocks.start, table.nodes, table.table,
-                d.coefficients, moving, d.huang, *blocks,
-            )
+        kernels.divergence(
+            self.rate_rows, self.point, self.D, self.S2, self.W, motion, self.velocity,
+            a.loose, a.owner, a.present, d.weights, d.x,
+            table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
+            d.case.model.rigid_motion, d.huang, *self._range(border),
+        )
+        for layer in self.layers:
+            layer.divergence(border, motion)
+            block_kernels.give(self.main.rate, layer.rate, layer.at)
+
+    def _range(self, border: bool) -> tuple[int, int]:
+        """The loose points at the border of the rank, or the others."""
+        return (0, self.active.loose_border) if border else (self.active.loose_border, self.active.loose.size)
 
     def _meet(self) -> None:
         """The pairs of particles that touch at this rank's points, after `_gather`; room for more is made if needed."""
-        d, a, c = self.d, self.active, self.d.coefficients.c
-        touching = self.touching[: self.touches]
+        d, a = self.d, self.active
         while True:
             found = self.contacts, self.between, self.where, self.share
-            count = kernels.meet(*found, 0, touching, self.point, a.loose, a.owner, d.weights, d.dim, c)
-            self.meetings = block_kernels.meet(
-                *found, count, touching, self.fields, a.blocks.blocks, a.blocks.first, a.blocks.owner,
-                d.blocks.points, d.weights, d.dim, c,
-            )
-            if self.meetings < len(self.share):
+            touching = self.touching[: self.touches]
+            count = kernels.meet(*found, 0, touching, self.point, a.loose, a.owner, d.weights, d.dim, d.coefficients.c)
+            for layer in self.layers:
+                count = layer.meet(found, count)
+            self.meetings = count
+            if count < len(self.share):
                 return
-            self._make_room(2 * self.meetings)
+            self._make_room(2 * count)
 
     def _make_room(self, pairs: int) -> None:
         """For that many pairs that touch at a point."""

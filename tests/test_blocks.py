@@ -8,11 +8,11 @@ import pytest
 from simulate import rates_of
 
 from frit.solver import block_kernels, blocks, vectors
-from frit.solver.arrays import Floats
-from frit.solver.blocks import MIXED, Blocks, find_blocks
+from frit.solver.arrays import Floats, Numbers
+from frit.solver.blocks import MIXED, Blocks, find_blocks, find_upright
 from frit.solver.case import Case, parse_case
 from frit.solver.discretisation import activity
-from frit.solver.geometry import Mesh, lattice
+from frit.solver.geometry import lattice
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, prepare
 from frit.solver.shape import lme
@@ -21,58 +21,71 @@ from frit.solver.simd import LANES, X86
 SIZES = [(23.0, 11.0), (18.0, 6.0, 5.0)]
 
 
-def nothing_shared(mesh: Mesh) -> Any:
-    return np.zeros(len(mesh.nodes), dtype=bool)
+class Grouped:
+    """The blocks of a lattice, along x and upright."""
+
+    def __init__(self, size: tuple[float, ...], nodes: Floats | None = None, shared: Any = None) -> None:
+        self.mesh = mesh = lattice(size, 0.8)
+        self.nodes = mesh.nodes if nodes is None else nodes
+        self.table = lme(mesh.points, mesh.spacing, self.nodes, 1.8, 1e-6)
+        self.shared = np.zeros(len(mesh.nodes), dtype=bool) if shared is None else shared
+        self.along = find_blocks(self.table, mesh.points, self.shared)
+        self.upright = find_upright(self.table, mesh.points, self.nodes, self.shared, self.along)
+
+    def seen(self, p: int) -> Numbers:
+        """The nodes of a point."""
+        return self.table.nodes[self.table.offsets[p] : self.table.offsets[p + 1]]
 
 
 @pytest.mark.parametrize("size", SIZES, ids=["2-D", "3-D"])
 def test_every_point_is_in_one_lane_or_loose(size: tuple[float, ...]) -> None:
-    mesh = lattice(size, 0.8)
-    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
-    found = find_blocks(table, mesh.points, nothing_shared(mesh))
-    numbers = np.concatenate([found.points[found.points >= 0], found.loose])
-    np.testing.assert_array_equal(np.sort(numbers), np.arange(len(mesh.points)))
-    assert ((found.points >= 0).sum(axis=1) >= 2).all()
-    assert found.loose.size < 0.4 * len(mesh.points)  # the first and last points of a row have functions of their own
+    """The first and last points of a row have functions of their own: those above each other go together. The box in
+    space is so small that most of these are near its floor or ceiling, too."""
+    found = Grouped(size)
+    lanes = [some.points[some.points >= 0] for some in (found.along, found.upright)]
+    np.testing.assert_array_equal(np.sort(np.concatenate([lanes[1], found.upright.loose])), np.sort(found.along.loose))
+    everyone = np.sort(np.concatenate([lanes[0], found.along.loose]))
+    np.testing.assert_array_equal(everyone, np.arange(len(found.mesh.points)))
+    for some in (found.along, found.upright):
+        assert ((some.points >= 0).sum(axis=1) >= 2).all()
+    assert found.along.loose.size < 0.4 * everyone.size
+    assert found.upright.loose.size < (0.3 if len(size) == 2 else 0.8) * found.along.loose.size
 
 
 @pytest.mark.parametrize("size", SIZES, ids=["2-D", "3-D"])
 def test_the_next_lane_sees_the_next_nodes(size: tuple[float, ...]) -> None:
-    mesh = lattice(size, 0.8)
-    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
-    found = find_blocks(table, mesh.points, nothing_shared(mesh))
-    for b, points in enumerate(found.points):
-        first = table.nodes[found.begin[b] : found.begin[b] + found.count[b]]
-        for j, p in enumerate(points):
-            if p >= 0:
-                np.testing.assert_array_equal(table.nodes[table.offsets[p] : table.offsets[p + 1]], first + j)
-                assert table.rows[p] == found.start[b]
-                np.testing.assert_array_equal(found.x[3 * b : 3 * b + mesh.points.shape[1], j], mesh.points[p])
-            else:
-                assert (points[j:] < 0).all()
+    """Along y the next of those that are numbered so."""
+    found = Grouped(size)
+    dim = len(size)
+    for some in (found.along, found.upright):
+        at = some.at if some.at.size else np.arange(len(found.mesh.nodes))
+        for b, points in enumerate(some.points):
+            first = some.nodes[some.begin[b] : some.begin[b] + some.count[b]]
+            for j, p in enumerate(points):
+                if p >= 0:
+                    np.testing.assert_array_equal(found.seen(p), at[first + j])
+                    assert found.table.rows[p] == some.start[b]
+                    np.testing.assert_array_equal(some.x[3 * b : 3 * b + dim, j], found.mesh.points[p])
+                else:
+                    assert (points[j:] < 0).all()
 
 
 def test_points_of_scattered_nodes_are_loose() -> None:
-    mesh = lattice((9.0, 7.0), 0.8)
-    nodes = mesh.nodes + np.random.default_rng(0).uniform(-0.05, 0.05, mesh.nodes.shape)
-    table = lme(mesh.points, mesh.spacing, nodes, 1.8, 1e-6)
-    found = find_blocks(table, mesh.points, nothing_shared(mesh))
-    assert len(found.points) == 0
-    np.testing.assert_array_equal(found.loose, np.arange(len(mesh.points)))
+    nodes = lattice((9.0, 7.0), 0.8).nodes
+    found = Grouped((9.0, 7.0), nodes + np.random.default_rng(0).uniform(-0.05, 0.05, nodes.shape))
+    for some in (found.along, found.upright):
+        assert len(some.points) == 0
+        np.testing.assert_array_equal(some.loose, np.arange(len(found.mesh.points)))
 
 
 def test_who_sees_a_shared_node_is_at_the_border() -> None:
-    mesh = lattice((23.0, 11.0), 0.8)
-    table = lme(mesh.points, mesh.spacing, mesh.nodes, 1.8, 1e-6)
-    shared = mesh.nodes[:, 1] > 9.0
-    found = find_blocks(table, mesh.points, shared)
-    at_border = np.zeros(len(mesh.points), dtype=bool)
-    for p in range(len(mesh.points)):
-        at_border[p] = shared[table.nodes[table.offsets[p] : table.offsets[p + 1]]].any()
-    assert 0 < found.border.sum() < len(found.border)
-    for lanes, border in zip(found.points, found.border, strict=True):
-        assert at_border[lanes[lanes >= 0]].any() == border
-    np.testing.assert_array_equal(at_border[found.loose], np.arange(found.loose.size) < found.loose_border)
+    found = Grouped((23.0, 25.0), shared=lattice((23.0, 25.0), 0.8).nodes[:, 1] > 23.0)
+    at_border = np.array([found.shared[found.seen(p)].any() for p in range(len(found.mesh.points))])
+    for some in (found.along, found.upright):
+        assert 0 < some.border.sum() < len(some.border)
+        for lanes, border in zip(some.points, some.border, strict=True):
+            assert at_border[lanes[lanes >= 0]].any() == border
+        np.testing.assert_array_equal(at_border[some.loose], np.arange(some.loose.size) < some.loose_border)
 
 
 # --- rates, and the choice of live points
@@ -109,6 +122,7 @@ def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(found, **empty, loose=every, loose_border=int(edge.sum()))
 
     monkeypatch.setattr("frit.solver.discretisation.find_blocks", none)
+    monkeypatch.setattr("frit.solver.discretisation.find_upright", lambda table, x, positions, shared, found: found)
 
 
 @pytest.mark.parametrize("advection", ["huang", "wang", None])
@@ -126,8 +140,8 @@ def test_rates_are_those_of_single_points(
     one_by_one(monkeypatch)
     single, same = prepare(case, mesh, ranks)
     together, alone = scheme.active, single.active
-    assert len(together.blocks.blocks) > 0
-    assert len(alone.blocks.blocks) == 0
+    assert min(len(together.blocks.blocks), len(together.upright.blocks), len(together.loose)) > 0
+    assert len(alone.blocks.blocks) == len(alone.upright.blocks) == 0
     assert enabled == (together.live.size < len(mesh.points))
     assert together.blocks.partial.any()
     np.testing.assert_array_equal(together.live, alone.live)
@@ -136,8 +150,9 @@ def test_rates_are_those_of_single_points(
     np.testing.assert_array_equal(together.watch, alone.watch)
     exact = rates_of(single, same)
     rate = rates_of(scheme, state)
-    mixed = np.where(together.blocks.particle >= 0, MIXED, -1)  # as if lanes had different particles
-    scheme.active = replace(together, blocks=replace(together.blocks, particle=mixed.astype(np.int32)))
+    for layer in scheme.layers:  # as if lanes had different particles
+        mixed = np.where(layer.live.particle >= 0, MIXED, -1).astype(np.int32)
+        layer.live = replace(layer.live, particle=mixed)
     np.testing.assert_allclose(rates_of(scheme, state), rate, rtol=0, atol=1e-13 * np.abs(rate).max())
     for column in range(rate.shape[1]):
         scale = max(np.abs(exact[:, column]).max(), 1e-30)

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from simulate import Result, merged, simulate
 
-from frit.solver.rigid import Pattern
-
 PAIR: dict[str, Any] = {
     "domain": {"size": [60.0, 40.0]},
     "nodes": {"source": "lattice", "spacing": 1.0},
@@ -25,23 +23,6 @@ def centres(result: Result) -> np.ndarray:
         eta = result.field(a)
         found.append(d.first_moment.T @ eta / (d.mass @ eta) + 0.5 * np.asarray(result.case.domain.size))
     return np.array(found)
-
-
-@pytest.mark.parametrize("size", [3, 6])
-def test_contacts_make_the_system_that_their_blocks_spell(size: int) -> None:
-    """Particle 3 touches nobody; 1 has three partners, whose blocks on the diagonal add up."""
-    rng = np.random.default_rng(size)
-    pairs = np.array([[0, 1], [1, 2], [1, 4]])
-    blocks = rng.standard_normal((4 * len(pairs), size, size))
-    expected = np.eye(5 * size)
-    for i, (a, b) in enumerate(pairs):
-        for k, (row, column) in enumerate(((a, a), (a, b), (b, a), (b, b))):
-            part = expected[row * size : (row + 1) * size, column * size : (column + 1) * size]
-            part += blocks[k * len(pairs) + i]
-    matrix = Pattern(pairs, 5, size).matrix(blocks)
-    np.testing.assert_allclose(matrix.toarray(), expected, rtol=0, atol=1e-14)
-    assert matrix.has_canonical_format
-    assert Pattern(pairs[:0], 2, size).matrix(blocks[:0]).toarray().tolist() == np.eye(2 * size).tolist()
 
 
 @pytest.mark.parametrize("advection", ["huang", "wang"])

@@ -1,0 +1,224 @@
+"""Gaussian elimination for particles that touch: one small block per particle, two per pair.
+
+(I + tau M S) V = b couples a particle to those it touches. Eliminating it couples those to one another, so the one with
+the fewest comes next (minimum degree); which pairs that adds is found once for given contacts, by `plan`. Rows are
+exchanged inside a particle's own block alone: where contacts push back, eigenvalues are at least 1 and need no more.
+Where a block has no inverse the solution is not finite, and the integrator tries a shorter step, with a smaller tau.
+"""
+
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
+
+import numpy as np
+
+from .arrays import Floats, Integers
+from .jit import inlined, jit
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Step i eliminates particle pivots[i] from the equations of later[e], e = first[i] ... first[i + 1] - 1.
+
+    These are sorted by the steps that eliminate them.
+    """
+
+    pairs: Integers  # (pairs, 2) particles that touch
+    pivots: Integers  # (particles,)
+    first: Integers  # (particles + 1,)
+    later: Integers  # (e,)
+    place: Integers  # (pairs,) entry e of each pair
+    target: Integers  # entry of the pair later[d], later[e] for every d < e of a step, in that order
+
+
+@dataclass(frozen=True)
+class Factors:
+    """The eliminated matrix: inverted blocks on the diagonal, and those of a step's particle with later ones."""
+
+    plan: Plan
+    inverse: Floats  # (particles, k, k)
+    upper: Floats  # (e, k, k) rows of the step's particle, columns of the later one
+    lower: Floats  # (e, k, k) the reverse, times the inverse
+
+    def solve(self, b: Floats) -> Floats:
+        """x of A x = b; both (particles, k)."""
+        x = b.copy()
+        substitute(x, self.inverse, self.upper, self.lower, self.plan.pivots, self.plan.first, self.plan.later)
+        return x
+
+
+def plan(pairs: Integers, particles: int) -> Plan:
+    """The elimination for the pairs (a, b), a != b, each given once."""
+    meets: list[set[int]] = [set() for _ in range(particles)]
+    for a, b in pairs.tolist():
+        meets[a].add(b)
+        meets[b].add(a)
+    queue = [(len(others), a) for a, others in enumerate(meets)]
+    heapify(queue)
+    step = np.full(particles, -1)
+    pivots: list[int] = []
+    rows: list[set[int]] = []
+    while queue:
+        degree, a = heappop(queue)
+        if step[a] >= 0 or degree != len(meets[a]):
+            continue  # gone, or its number of partners has changed since
+        step[a] = len(pivots)
+        pivots.append(a)
+        rows.append(meets[a])
+        for b in meets[a]:
+            meets[b] = (meets[b] | meets[a]) - {a, b}
+            heappush(queue, (len(meets[b]), b))
+    later = [sorted(row, key=step.__getitem__) for row in rows]
+    counts = np.array([len(row) for row in later], dtype=np.int64)
+    first = np.append(0, np.cumsum(counts))
+    entries = np.array([b for row in later for b in row], dtype=np.int64)
+    place = np.empty(len(pairs), dtype=np.int64)
+    target = np.empty(int((counts * (counts - 1) // 2).sum()), dtype=np.int64)
+    find_places(place, target, pairs, step, first, entries)
+    return Plan(pairs, np.array(pivots, dtype=np.int64), first, entries, place, target)
+
+
+@jit
+def find_places(
+    place: Integers, target: Integers, pairs: Integers, step: Integers, first: Integers, later: Integers
+) -> None:
+    """Fill `Plan.place` and `Plan.target`."""
+    for p in range(pairs.shape[0]):
+        place[p] = entry(pairs[p, 0], pairs[p, 1], step, first, later)
+    t = 0
+    for i in range(first.size - 1):
+        for d in range(first[i], first[i + 1]):
+            for e in range(d + 1, first[i + 1]):
+                target[t] = entry(later[d], later[e], step, first, later)
+                t += 1
+
+
+@jit
+def entry(a: int, b: int, step: Integers, first: Integers, later: Integers) -> int:
+    """The entry of a pair, by bisection: later particles are sorted by their steps."""
+    if step[a] > step[b]:
+        a, b = b, a
+    low = first[step[a]]
+    high = first[step[a] + 1]
+    while high - low > 1:
+        middle = (low + high) // 2
+        if step[later[middle]] <= step[b]:
+            low = middle
+        else:
+            high = middle
+    return int(low)
+
+
+def factors(found: Plan, blocks: Floats) -> Factors:
+    """The factors of I + the blocks (4 pairs, k, k) of the pairs' rows and columns (a, a), (a, b), (b, a), (b, b)."""
+    k = blocks.shape[1]
+    diagonal = np.tile(np.eye(k), (len(found.pivots), 1, 1))
+    upper, lower = np.zeros((2, len(found.later), k, k))
+    gather(diagonal, upper, lower, blocks, found.pairs, found.place, found.later)
+    eliminate(diagonal, upper, lower, found.pivots, found.first, found.later, found.target)
+    return Factors(found, diagonal, upper, lower)
+
+
+@jit
+def gather(
+    diagonal: Floats, upper: Floats, lower: Floats, blocks: Floats, pairs: Integers, place: Integers, later: Integers
+) -> None:
+    """Add the blocks to the matrix."""
+    count = pairs.shape[0]
+    for p in range(count):
+        a = pairs[p, 0]
+        b = pairs[p, 1]
+        e = place[p]
+        diagonal[a] += blocks[p]
+        diagonal[b] += blocks[3 * count + p]
+        if later[e] == b:
+            upper[e] += blocks[count + p]
+            lower[e] += blocks[2 * count + p]
+        else:
+            upper[e] += blocks[2 * count + p]
+            lower[e] += blocks[count + p]
+
+
+@jit
+def eliminate(
+    diagonal: Floats, upper: Floats, lower: Floats,
+    pivots: Integers, first: Integers, later: Integers, target: Integers,
+) -> None:
+    """Turn the matrix into its factors, in place."""
+    work = np.empty((1, diagonal.shape[1], diagonal.shape[1]))
+    t = 0
+    for i in range(pivots.size):
+        invert(diagonal[pivots[i]], work[0])
+        for e in range(first[i], first[i + 1]):
+            work[0] = lower[e]
+            lower[e] = 0.0
+            add_product(lower, e, work, 0, diagonal, pivots[i], 1.0)
+        for d in range(first[i], first[i + 1]):
+            add_product(diagonal, later[d], lower, d, upper, d, -1.0)
+            for e in range(d + 1, first[i + 1]):
+                add_product(upper, target[t], lower, d, upper, e, -1.0)
+                add_product(lower, target[t], lower, e, upper, d, -1.0)
+                t += 1
+
+
+@jit
+def substitute(
+    x: Floats, inverse: Floats, upper: Floats, lower: Floats, pivots: Integers, first: Integers, later: Integers
+) -> None:
+    """Turn the right-hand side x (particles, k) into the solution: forward, then back."""
+    k = x.shape[1]
+    right = np.empty(k)
+    for i in range(pivots.size):
+        for e in range(first[i], first[i + 1]):
+            for r in range(k):
+                for c in range(k):
+                    x[later[e], r] -= lower[e, r, c] * x[pivots[i], c]
+    for i in range(pivots.size - 1, -1, -1):
+        right[:] = x[pivots[i]]
+        for e in range(first[i], first[i + 1]):
+            for r in range(k):
+                for c in range(k):
+                    right[r] -= upper[e, r, c] * x[later[e], c]
+        for r in range(k):
+            x[pivots[i], r] = 0.0
+            for c in range(k):
+                x[pivots[i], r] += inverse[pivots[i], r, c] * right[c]
+
+
+@inlined
+def add_product(result: Floats, r: int, a: Floats, p: int, b: Floats, q: int, factor: float) -> None:
+    """result[r] += factor a[p] b[q], all (k, k)."""
+    k = result.shape[1]
+    for i in range(k):
+        for j in range(k):
+            value = 0.0
+            for s in range(k):
+                value += a[p, i, s] * b[q, s, j]
+            result[r, i, j] += factor * value
+
+
+@jit
+def invert(block: Floats, work: Floats) -> None:
+    """Replace a block (k, k) by its inverse, by Gauss and Jordan with row exchange; not finite where it has none."""
+    k = block.shape[0]
+    work[:] = block
+    block[:] = 0.0
+    for r in range(k):
+        block[r, r] = 1.0
+    for s in range(k):
+        best = s
+        for r in range(s + 1, k):
+            if abs(work[r, s]) > abs(work[best, s]):
+                best = r
+        for c in range(k):
+            work[s, c], work[best, c] = work[best, c], work[s, c]
+            block[s, c], block[best, c] = block[best, c], block[s, c]
+        scale = 1.0 / work[s, s]
+        for c in range(k):
+            work[s, c] *= scale
+            block[s, c] *= scale
+        for r in range(k):
+            if r != s:
+                share = work[r, s]
+                for c in range(k):
+                    work[r, c] -= share * work[s, c]
+                    block[r, c] -= share * block[s, c]

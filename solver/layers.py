@@ -1,0 +1,63 @@
+"""The blocks of one kind, with the fields of their nodes and points as `block_kernels` wants them."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from . import block_kernels
+from .arrays import Floats, Integers, Numbers
+from .blocks import Blocks, LiveBlocks
+from .discretisation import Discretisation
+from .simd import LANES
+
+Contacts = tuple[Floats, Numbers, Integers, Floats]  # contacts, between, where, share: see `kernels.meet`
+
+
+class Layer:
+    """Blocks along x, whose nodes are the rank's; or upright ones, whose nodes are some of these, numbered along y."""
+
+    def __init__(
+        self, d: Discretisation, blocks: Blocks, live: LiveBlocks, columns: int, room: Callable[[int], Floats]
+    ) -> None:
+        """columns: F; room(rows): work space (rows, LANES)."""
+        self.d, self.blocks, self.live = d, blocks, live
+        self.at = blocks.at if live.blocks.size else blocks.at[:0]
+        nodes = self.at.size if blocks.at.size else d.nodes
+        self.u, self.rate = np.zeros((2, columns, nodes + LANES))  # the rates are 0 between evaluations
+        self.W = np.zeros((1, nodes + LANES))
+        self.D, self.S2 = np.empty((2, live.blocks.size, LANES))
+        self.fields = room(live.column.size * (1 + d.dim))
+        self.touching = np.empty(LANES * live.blocks.size, dtype=np.int64)
+        self.touches = 0
+
+    def _range(self, border: bool) -> tuple[int, int]:
+        """The live blocks at the border of the rank, or the others."""
+        return (0, self.live.border) if border else (self.live.border, self.live.blocks.size)
+
+    def potential(self, border: bool) -> None:
+        """`block_kernels.potential` of the blocks at the border, which come first, or of the others."""
+        blocks, live, d = self.blocks, self.live, self.d
+        self.touches = block_kernels.potential(
+            self.W, self.touching, self.fields, self.D, self.S2, self.u,
+            live.blocks, live.weights, live.first, live.column, live.owner, live.partial,
+            blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table, d.coefficients,
+            *self._range(border), 0 if border else self.touches,
+        )
+
+    def divergence(self, border: bool, motion: Floats) -> None:
+        """`block_kernels.divergence` of the same."""
+        blocks, live, d = self.blocks, self.live, self.d
+        block_kernels.divergence(
+            self.rate, self.fields, self.D, self.S2, self.W, motion,
+            live.blocks, live.weights, live.first, live.column, live.particle, live.owner,
+            blocks.x, blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table,
+            d.coefficients, d.case.model.rigid_motion, d.huang, *self._range(border),
+        )
+
+    def meet(self, found: Contacts, count: int) -> int:
+        """`block_kernels.meet` of all."""
+        live, d = self.live, self.d
+        return block_kernels.meet(
+            *found, count, self.touching[: self.touches], self.fields, live.blocks, live.first, live.owner,
+            self.blocks.points, d.weights, d.dim, d.coefficients.c,
+        )

@@ -412,6 +412,16 @@ def test_still_points_pay_their_shares(ranks: Ranks, pack: tuple[Tree, Mesh, Sta
     assert error < 0.01 * crude
 
 
+def test_nothing_rests_at_eps_zero(ranks: Ranks, pack: tuple[Tree, Mesh, State]) -> None:
+    """Every point lives and every order parameter exists wherever it is not 0: the rates are those of all of them."""
+    zero = {"eps_rho": 0.0, "eps_eta": 0.0}
+    scheme, full, rate, exact = compare(ranks, pack, HUANG, zero)
+    assert scheme.active.live.size == scheme.d.shape.points
+    assert scheme.active.stale(everything(pack[2]).u) >= 0.0
+    np.testing.assert_allclose(rate, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+    np.testing.assert_allclose(scheme.motion, full.motion, rtol=1e-10, atol=1e-12)
+
+
 def test_choosing_again_from_the_same_state_gives_the_same(ranks: Ranks) -> None:
     """A resumed run chooses the live points of its reference state again, and must come to the same set and owners."""
     mesh = build_mesh(pack_case(LME), ranks)

@@ -20,7 +20,7 @@ from .state import State
 
 
 class Scheme:
-    """du/dt = rates(u) on one rank's nodes, for the live points of the moment."""
+    """dy/dt = rates(y): what changes on one rank's nodes (`unknowns`), for the live points of the moment."""
 
     def __init__(self, d: Discretisation, state: State) -> None:
         self.d = d

@@ -2,7 +2,8 @@
 
 (I + tau M S) V = b couples a particle to those it touches. Eliminating it couples those to one another, so the one with
 the fewest comes next (minimum degree); which pairs that adds is found once for given contacts, by `plan`. Rows are
-exchanged inside a particle's own block alone: where contacts push back, eigenvalues are at least 1 and need no more.
+exchanged inside a particle's own block alone: where contacts push back, eigenvalues are at least 1 and need no more (a
+digit is lost in one of a thousand random systems of that kind).
 Where a block has no inverse the solution is not finite, and the integrator tries a shorter step, with a smaller tau.
 """
 

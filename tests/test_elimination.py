@@ -46,7 +46,8 @@ def test_it_solves_what_the_blocks_spell(graph: Graph, k: int, seed: int) -> Non
 @settings(max_examples=100, deadline=None)
 def test_stiff_contacts(graph: Graph, k: int, seed: int) -> None:
     """I + M S, M of each particle and S of springs between them positive, 1000 times stiffer than I: no exchange of
-    particles is needed. The error is the round-off times the condition.
+    particles is needed. The error is the round-off of so many rows times the condition; that particles are not
+    exchanged costs a digit in one of a thousand such systems, two more are left to the others.
     """
     (pairs, particles), rng = graph, np.random.default_rng(seed)
     parts = np.zeros((4, len(pairs), k, k))
@@ -58,12 +59,12 @@ def test_stiff_contacts(graph: Graph, k: int, seed: int) -> None:
     blocks = parts.reshape(-1, k, k)
     matrix, b = whole(pairs, particles, blocks), rng.standard_normal((particles, k))
     exact = np.linalg.solve(matrix, b.ravel()).reshape(b.shape)
-    slack = 1e-14 * np.linalg.cond(matrix) * np.abs(exact).max()
+    slack = 1e3 * len(matrix) * np.finfo(float).eps * np.linalg.cond(matrix) * np.abs(exact).max()
     np.testing.assert_allclose(factors(plan(pairs, particles), blocks).solve(b), exact, rtol=0, atol=slack)
 
 
 @given(graphs())
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_every_particle_goes_once_and_later_ones_later(graph: Graph) -> None:
     """Each pair has the entry that names it, and so has each pair of those that a step couples."""
     pairs, particles = graph

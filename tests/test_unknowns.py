@@ -42,7 +42,7 @@ layouts = st.integers(0, 10_000).map(Layout)
 
 
 @given(layouts)
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_it_holds_what_exists_and_nothing_else(layout: Layout) -> None:
     """rho at each node that changes, an order parameter where somebody has the slot; back and forth to the last bit."""
     y = layout.unknowns.take(layout.u)
@@ -54,7 +54,7 @@ def test_it_holds_what_exists_and_nothing_else(layout: Layout) -> None:
 
 
 @given(layouts)
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_strips_have_one_field_one_particle_and_one_kind(layout: Layout) -> None:
     """Shared nodes come first; in each of the two parts entries are sorted by column and node: all ranks agree."""
     places, strips = layout.unknowns, layout.unknowns.strips
@@ -77,7 +77,7 @@ def test_strips_have_one_field_one_particle_and_one_kind(layout: Layout) -> None
 
 
 @given(layouts)
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_sums_of_the_points_come_back_once(layout: Layout) -> None:
     """What blocks and loose points have added, over m_a; then there is nothing left."""
     strips, rng = layout.unknowns.strips, layout.rng
@@ -100,7 +100,7 @@ def test_sums_of_the_points_come_back_once(layout: Layout) -> None:
 
 
 @given(layouts)
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_sums_over_owned_nodes(layout: Layout) -> None:
     """Moments, squares and the error of a step, each against its formula; the order of summation differs."""
     strips, rng = layout.unknowns.strips, layout.rng
@@ -122,7 +122,7 @@ def test_sums_over_owned_nodes(layout: Layout) -> None:
 
 
 @given(layouts)
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 def test_the_largest_change_counts_what_is_watched(layout: Layout) -> None:
     reference, weight = layout.rng.standard_normal((2, layout.unknowns.size))
     weight = np.maximum(weight, 0.0)

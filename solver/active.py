@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import block_kernels, kernels, slots, unknowns
-from .arrays import Array, Flags, Floats, Integers, Numbers
+from .arrays import Array, Bytes, Flags, Floats, Integers, Numbers
 from .block_kernels import SMALLEST
 from .blocks import LiveBlocks, live_blocks
 from .discretisation import FIXED_WORK, WORTH, Discretisation
@@ -88,7 +88,9 @@ def activate(d: Discretisation, state: State) -> Active:
     blocks, upright = (live_blocks(some, flags, owner, d.weights) for some in (d.blocks, d.upright))
     kind = np.where(d.share.halo.owned, unknowns.OWNED, 0)
     kind |= unknowns.BLOCKS if blocks.blocks.size or upright.blocks.size else 0
-    kind[_seen_by(d, loose)] |= unknowns.LOOSE
+    by_itself = np.zeros(d.shape.points, dtype=bool)
+    by_itself[loose] = True
+    kind[_seen_by(d, by_itself) != 0] |= unknowns.LOOSE
     kind[edge_nodes] |= unknowns.LOOSE
     moved, rest = (unknowns.lay_out(np.flatnonzero(s), state.owner, kind, d.share.halo) for s in (moving, ~moving))
     moments = np.zeros((len(state.slot_of), 1 + d.dim))
@@ -252,21 +254,19 @@ def _watch(d: Discretisation, flags: Numbers, owner: Numbers, node_owner: Number
     return np.where(bits & 1, np.where(column == 0, rho, eta), np.where(bits >> column & 1, slot, 0.0))
 
 
-def _seen_by(d: Discretisation, chosen: Integers) -> Flags:
-    """Which nodes of this rank the chosen points see."""
-    flags, seen = np.zeros(d.shape.points, dtype=bool), np.zeros(d.nodes, dtype=np.int8)
-    flags[chosen] = True
-    kernels.touch(seen, flags, d.shape.offsets, d.shape.nodes)
-    return seen.astype(bool)
+def _seen_by(d: Discretisation, chosen: Flags) -> Bytes:
+    """Which nodes of this rank its chosen points see, 1 or 0."""
+    seen = np.zeros(d.nodes, dtype=np.int8)
+    if chosen.all():
+        seen[:] = 1  # a rank holds only nodes that its points see
+    elif chosen.any():
+        kernels.touch(seen, chosen, d.shape.offsets, d.shape.nodes)
+    return seen
 
 
 def _touched(d: Discretisation, chosen: Flags) -> Flags:
     """Which nodes a chosen point of any rank sees."""
-    touched = np.zeros(d.nodes, dtype=np.int8)
-    if chosen.all():
-        touched[:] = 1  # a rank holds only nodes that its points see
-    elif chosen.any():
-        kernels.touch(touched, chosen, d.shape.offsets, d.shape.nodes)
+    touched = _seen_by(d, chosen)
     d.share.halo.most(touched)
     return touched.astype(bool)
 

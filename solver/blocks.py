@@ -63,7 +63,7 @@ def find_blocks(table: ShapeTable, x: Floats, shared: Flags) -> Blocks:
     return _group(np.arange(table.points), table.offsets, table.nodes, table.rows, x, border, NONE)
 
 
-def find_upright(table: ShapeTable, x: Floats, positions: Floats, shared: Flags, along: Blocks) -> Blocks:
+def find_upright(table: ShapeTable, x: Floats, positions: Floats, along: Blocks) -> Blocks:
     """The blocks along y of the points that are loose in those along x; positions (n, dim) of the nodes."""
     chosen = np.sort(along.loose)
     offsets = np.append(0, np.cumsum(table.offsets[chosen + 1] - table.offsets[chosen]))
@@ -75,8 +75,7 @@ def find_upright(table: ShapeTable, x: Floats, positions: Floats, shared: Flags,
     at = at[np.lexsort(_up(positions[at], _period(x[chosen], table.rows[chosen])))]
     number = np.full(len(positions), -1, dtype=np.int32)
     number[at] = np.arange(at.size)
-    border = np.zeros(chosen.size, dtype=bool)
-    see(border, shared, offsets, nodes)
+    border = np.isin(chosen, along.loose[: along.loose_border])
     found = _group(chosen, offsets, number[nodes], table.rows[chosen], x, border, at)
     begin = np.append(0, np.cumsum(found.count))
     kept = np.empty(int(begin[-1]), dtype=np.int32)

@@ -92,7 +92,7 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     positions = mesh.nodes[nodes]
     at_wall = np.asarray((np.minimum(positions, size - positions) <= mesh.spacing.max()).any(axis=1))
     blocks = find_blocks(table, x, shared)
-    upright = find_upright(table, x, positions, shared, blocks)
+    upright = find_upright(table, x, positions, blocks)
     return Discretisation(
         case, share, table, blocks, upright, nearest(table, NEAR), steepest(table, ranks),
         positions, at_wall, x, weights, mass, first_moment,

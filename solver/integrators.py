@@ -242,7 +242,7 @@ class Chebyshev:
             vectors.advance(moved, self.old, delta / length, direction)
             scheme.rates(moved, rate)
             state.evaluations += 1
-            vectors.difference(direction, rate, self.rate_0)
+            np.subtract(rate, self.rate_0, out=direction)
             length = sqrt(_total(ranks, unknowns.squares(direction, places.strips)))
             previous, radius = radius, length / delta
             if abs(radius - previous) <= 0.01 * radius or length == 0.0:

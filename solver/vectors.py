@@ -27,13 +27,6 @@ def chebyshev_stage(
 
 
 @jit
-def difference(new: Floats, a: Floats, b: Floats) -> None:
-    """new = a - b."""
-    for i in range(new.size):
-        new[i] = a[i] - b[i]
-
-
-@jit
 def hermite(
     new: Floats, old: Floats, rate_0: Floats, y: Floats, rate_1: Floats, dt: float, theta: float
 ) -> None:

@@ -30,7 +30,7 @@ class Grouped:
         self.table = lme(mesh.points, mesh.spacing, self.nodes, 1.8, 1e-6)
         self.shared = np.zeros(len(mesh.nodes), dtype=bool) if shared is None else shared
         self.along = find_blocks(self.table, mesh.points, self.shared)
-        self.upright = find_upright(self.table, mesh.points, self.nodes, self.shared, self.along)
+        self.upright = find_upright(self.table, mesh.points, self.nodes, self.along)
 
     def seen(self, p: int) -> Numbers:
         """The nodes of a point."""
@@ -122,7 +122,7 @@ def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(found, **empty, loose=every, loose_border=int(edge.sum()))
 
     monkeypatch.setattr("frit.solver.discretisation.find_blocks", none)
-    monkeypatch.setattr("frit.solver.discretisation.find_upright", lambda table, x, positions, shared, found: found)
+    monkeypatch.setattr("frit.solver.discretisation.find_upright", lambda table, x, positions, found: found)
 
 
 @pytest.mark.parametrize("advection", ["huang", "wang", None])

@@ -301,12 +301,32 @@ def test_two_that_open_at_once_make_one_good_index(tmp_path: Path) -> None:
             assert child.stdin is not None
             child.stdin.write("\n")
             child.stdin.flush()
-        for child in children:
-            _, errors = child.communicate(timeout=120)
-            assert child.returncode == 0, errors
+        errors = [child.communicate(timeout=120)[1] for child in children]
+        assert [child.returncode for child in children] == [0, 0], errors
         assert version(folder / "frit.db") == NEWEST
         assert sorted(row["name"] for row in rows(folder / "frit.db", "jobs")) == ["job 0", "job 1"]
         assert is_whole(folder / "frit.db")
+
+
+def test_an_index_made_between_two_looks_is_not_taken_for_another_program_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "frit.db"
+    path.touch()
+    other = threading.Thread(target=migrations.upgrade, args=(path,))
+    look = MigrationContext.get_current_revision
+
+    def look_and_linger(context: MigrationContext) -> str | None:
+        found = look(context)
+        if other.ident is None:
+            other.start()
+            other.join(1.0)
+        return found
+
+    monkeypatch.setattr(MigrationContext, "get_current_revision", look_and_linger)
+    assert migrations.versions(path) == (None, NEWEST)
+    other.join()
+    assert migrations.versions(path) == (NEWEST, NEWEST)
 
 
 def test_the_switch_to_a_log_waits_for_another_that_writes(tmp_path: Path) -> None:

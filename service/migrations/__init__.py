@@ -37,6 +37,7 @@ def versions(path: Path) -> tuple[str | None, str]:
         return None, newest
     try:
         with sa.create_engine(f"sqlite:///{path}", poolclass=sa.NullPool).connect() as connection:
+            connection.exec_driver_sql("BEGIN")  # both looks see the same index, even while another makes it
             present = MigrationContext.configure(connection).get_current_revision()
             if present is None and sa.inspect(connection).get_table_names():
                 raise IndexVersionError(f"{path}: a database, but not an index of frit")

@@ -9,9 +9,10 @@ derivatives. Lanes without a live point have the weight 0: they see some nodes, 
 import numpy as np
 
 from .arrays import Flags, Floats, Integers, Numbers
+from .contacts import FAR, Contacts, add_contact
 from .energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
-from .kernels import FAR, touching_share, x_velocity, y_velocity, z_velocity
+from .kernels import x_velocity, y_velocity, z_velocity
 from .simd import LANES, flush_denormals, load, positive, restore_denormals, splat, store, total, transpose
 from .slots import MOST_SLOTS
 
@@ -138,17 +139,18 @@ def potential(
     W: Floats, touching: Integers, fields: Floats, D: Floats, squares: Floats, columns: Floats,
     blocks: Integers, live_weights: Floats, first: Integers, column: Numbers, owner: Numbers, partial: Flags,
     begins: Integers, counts: Integers, starts: Integers, nodes: Numbers, table: Floats, m: Coefficients,
-    low: int, high: int, touches: int,
+    low: int, high: int,
 ) -> int:
     """First half of an evaluation, as `kernels.potential`: fields, D and S2 of live blocks low ... high - 1.
 
-    W (1, n + LANES) gets their shares. touching gets LANES l + j for lane j of block l where particles may touch;
-    returned: `touches` and those.
+    W (1, n + LANES) gets their shares, touching the l of the blocks in which particles may touch; their number is
+    returned.
     """
     mode = flush_denormals()
     width = table.shape[0]
-    there, overlaps = np.empty((1, LANES)), np.empty((1, LANES))
+    there = np.empty((1, LANES))
     flow = np.empty((4, LANES))
+    touches = 0
     for l in range(low, high):
         b = blocks[l]
         begin = begins[b]
@@ -190,45 +192,34 @@ def potential(
         for k in range(1, width):
             store(flow, k, 0, (w * m.kappa_rho) * load(fields, row + k, 0))
         scatter(W, 0, flow, 0, begin, count, start, nodes, table)
-        if end - first[l] > 2:
-            store(overlaps, 0, 0, overlap)
-            for j in range(LANES):
-                if overlaps[0, j] > m.c and live_weights[l, j] > 0.0:
-                    touching[touches] = LANES * l + j
-                    touches += 1
+        if end - first[l] > 2 and total(w * positive(overlap - m.c)) > 0.0:
+            touching[touches] = l
+            touches += 1
     restore_denormals(mode)
     return touches
 
 
 @jit
 def meet(
-    contacts: Floats, between: Numbers, where: Integers, share: Floats, count: int,
-    touching: Integers, fields: Floats, blocks: Integers, first: Integers, owner: Numbers,
-    points: Numbers, weights: Floats, dim: int, c: float,
-) -> int:
-    """`kernels.meet` for the points in blocks."""
-    width = 1 + dim
-    for lane in touching:
-        l = lane // LANES
-        j = lane % LANES
+    found: Contacts, fields: Floats, blocks: Integers, live_weights: Floats, first: Integers, owner: Numbers,
+    points: Numbers, touching: Integers, c: float,
+) -> None:
+    """`kernels.meet` for the points in the live blocks `touching`: fields are 0 in lanes where they do not exist."""
+    width = found.values.shape[1] // 3
+    products = np.empty((1, LANES))
+    for l in touching:
         for e in range(first[l] + 1, first[l + 1]):
-            if owner[e, j] < 0 or fields[e * width, j] <= 0.0:
-                continue
             for g in range(e + 1, first[l + 1]):
-                if owner[g, j] < 0 or fields[e * width, j] * fields[g * width, j] <= FAR * c:
+                product = load(fields, e * width, 0) * load(fields, g * width, 0)
+                if not total(positive(product - FAR * c)) > 0.0:
                     continue
-                r = min(count, share.size - 1)
-                a, b = (e, g) if owner[e, j] < owner[g, j] else (g, e)
-                between[r, 0] = owner[a, j]
-                between[r, 1] = owner[b, j]
-                where[r] = points[blocks[l], j]
-                for k in range(width):
-                    contacts[r, k] = fields[first[l] * width + k, j]
-                    contacts[r, width + k] = fields[a * width + k, j]
-                    contacts[r, 2 * width + k] = fields[b * width + k, j]
-                share[r] = weights[where[r]] * touching_share(contacts, r, weights[where[r]], dim, c)
-                count += share[r] > 0.0
-    return count
+                store(products, 0, 0, product)
+                for j in range(LANES):
+                    if products[0, j] > FAR * c and fields[e * width, j] > 0.0:
+                        add_contact(
+                            found, fields, first[l] * width, j, e * width, j, g * width, j,
+                            owner[e, j], owner[g, j], points[blocks[l], j], live_weights[l, j], c,
+                        )
 
 
 @jit

@@ -8,7 +8,6 @@ Where a block has no inverse the solution is not finite, and the integrator trie
 """
 
 from dataclasses import dataclass
-from heapq import heapify, heappop, heappush
 
 import numpy as np
 
@@ -23,7 +22,7 @@ class Plan:
     These are sorted by the steps that eliminate them.
     """
 
-    pairs: Integers  # (pairs, 2) particles that touch
+    pairs: Integers  # (pairs, 2) particles that push each other
     pivots: Integers  # (particles,)
     first: Integers  # (particles + 1,)
     later: Integers  # (e,)
@@ -49,33 +48,68 @@ class Factors:
 
 def plan(pairs: Integers, particles: int) -> Plan:
     """The elimination for the pairs (a, b), a != b, each given once."""
-    meets: list[set[int]] = [set() for _ in range(particles)]
-    for a, b in pairs.tolist():
-        meets[a].add(b)
-        meets[b].add(a)
-    queue = [(len(others), a) for a, others in enumerate(meets)]
-    heapify(queue)
-    step = np.full(particles, -1)
-    pivots: list[int] = []
-    rows: list[set[int]] = []
-    while queue:
-        degree, a = heappop(queue)
-        if step[a] >= 0 or degree != len(meets[a]):
-            continue  # gone, or its number of partners has changed since
-        step[a] = len(pivots)
-        pivots.append(a)
-        rows.append(meets[a])
-        for b in meets[a]:
-            meets[b] = (meets[b] | meets[a]) - {a, b}
-            heappush(queue, (len(meets[b]), b))
-    later = [sorted(row, key=step.__getitem__) for row in rows]
-    counts = np.array([len(row) for row in later], dtype=np.int64)
+    pivots, counts, partners = order(pairs, particles)
+    step = np.empty(particles, dtype=np.int64)
+    step[pivots] = np.arange(particles)
+    later = partners[np.lexsort((step[partners], np.repeat(np.arange(particles), counts)))]
     first = np.append(0, np.cumsum(counts))
-    entries = np.array([b for row in later for b in row], dtype=np.int64)
     place = np.empty(len(pairs), dtype=np.int64)
     target = np.empty(int((counts * (counts - 1) // 2).sum()), dtype=np.int64)
-    find_places(place, target, pairs, step, first, entries)
-    return Plan(pairs, np.array(pivots, dtype=np.int64), first, entries, place, target)
+    find_places(place, target, pairs, step, first, later)
+    return Plan(pairs, pivots, first, later, place, target)
+
+
+@jit
+def order(pairs: Integers, particles: int) -> tuple[Integers, Integers, Integers]:
+    """The particles in the order of elimination, of each the number of those it is coupled to then, and these.
+
+    Each is the one coupled to the fewest that are left, the first of them; those it leaves are then coupled.
+    """
+    degree = np.zeros(particles, dtype=np.int64)
+    for a in pairs.ravel():
+        degree[a] += 1
+    start = np.cumsum(degree) - degree
+    lists = np.empty(4 * pairs.size, dtype=np.int64)  # of the partners of a: lists[start[a]] ...; grows at its end
+    end = start.copy()
+    for a, b in pairs:
+        lists[end[a]], lists[end[b]] = b, a
+        end[a] += 1
+        end[b] += 1
+    used = pairs.size
+    waiting = degree.copy()  # the number of partners; more than any of those that are gone
+    mark = np.zeros(particles, dtype=np.int64)
+    joins = 0
+    pivots = np.empty(particles, dtype=np.int64)
+    for i in range(particles):
+        a = np.argmin(waiting)
+        pivots[i] = a
+        waiting[a] = particles
+        for k in range(start[a], end[a]):
+            b = lists[k]
+            most = end[b] - start[b] + end[a] - start[a]
+            if used + most > lists.size:
+                lists = np.concatenate((lists[:used], np.empty(used + most, dtype=np.int64)))
+            begin = used
+            joins += 1
+            mark[a] = mark[b] = joins
+            for j in range(start[b], end[b]):
+                if lists[j] != a:
+                    mark[lists[j]] = joins
+                    lists[used] = lists[j]
+                    used += 1
+            for j in range(start[a], end[a]):
+                if mark[lists[j]] != joins:
+                    lists[used] = lists[j]
+                    used += 1
+            start[b], end[b] = begin, used
+            waiting[b] = used - begin
+    counts = (end - start)[pivots]
+    partners = np.empty(counts.sum(), dtype=np.int64)
+    e = 0
+    for a in pivots:
+        partners[e : e + end[a] - start[a]] = lists[start[a] : end[a]]
+        e += end[a] - start[a]
+    return pivots, counts, partners
 
 
 @jit
@@ -188,7 +222,15 @@ def substitute(
 @inlined
 def add_product(result: Floats, r: int, a: Floats, p: int, b: Floats, q: int, factor: float) -> None:
     """result[r] += factor a[p] b[q], all (k, k)."""
-    k = result.shape[1]
+    if result.shape[1] == 3:
+        multiply(result, r, a, p, b, q, factor, 3)  # known to the compiler: loops are unrolled
+    else:
+        multiply(result, r, a, p, b, q, factor, 6)
+
+
+@inlined
+def multiply(result: Floats, r: int, a: Floats, p: int, b: Floats, q: int, factor: float, k: int) -> None:
+    """`add_product` for a given k."""
     for i in range(k):
         for j in range(k):
             value = 0.0

@@ -13,6 +13,7 @@ rows their derivatives.
 import numpy as np
 
 from .arrays import Bytes, Flags, Floats, Integers, Numbers
+from .contacts import Contacts, add_contact
 from .energy import Coefficients, Field, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
 from .simd import (
@@ -27,8 +28,6 @@ from .simd import (
     total,
     with_first,
 )
-
-FAR = 0.5  # of c: no cell counts as so large that the level c reaches it where eta_a eta_b is this far from c
 
 
 @inlined
@@ -127,15 +126,16 @@ def potential(
     W: Floats, touching: Integers, point: Floats, D: Floats, squares: Floats, u: Floats,
     loose: Integers, mask: Floats, present: Flags, several: Flags, weights: Floats,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats, work: Floats, m: Coefficients,
-    low: int, high: int, touches: int,
+    low: int, high: int,
 ) -> int:
     """First half of an evaluation: fields and D at the points loose[low] ... loose[high - 1], and their shares of W.
 
-    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching from `touches` on with the l of the
-    points where two particles may touch: where sum_{a < b} eta_a eta_b > c / 2. Returned: `touches` and those.
+    W (n,) gets partial sums; point, D and squares = S2 are filled, and touching with the l of the points where two
+    particles may touch: where sum_{a < b} eta_a eta_b > c / 2. Their number is returned.
     """
     mode = flush_denormals()
     width = table.shape[0]
+    touches = 0
     for l in range(low, high):
         p = loose[l]
         row = l * width
@@ -179,138 +179,18 @@ def potential(
 
 
 @jit
-def touching_share(contacts: Floats, r: int, w: float, dim: int, c: float) -> float:
-    """The share of a point's cell in which eta_a eta_b > c, for row r of the contacts.
-
-    The cell counts as a ball of its volume w, and the product as linear in it: with d the distance of the level c from
-    the point in radii, 1/2 + d (3 - d^2) / 4 of the ball are above it. As an interface sweeps over the points the
-    contact force then follows it without jumps; as the cells shrink, it becomes the bracket of (6).
-    """
-    a = 1 + dim
-    b = 2 + 2 * dim
-    product = contacts[r, a] * contacts[r, b]
-    if abs(product - c) >= (1.0 - FAR) * c:
-        return 1.0 if product > c else 0.0
-    square = 0.0
-    for k in range(1, 1 + dim):
-        slope = contacts[r, a] * contacts[r, b + k] + contacts[r, b] * contacts[r, a + k]
-        square += slope * slope
-    radius = np.sqrt(w / np.pi) if dim == 2 else np.cbrt(0.75 * w / np.pi)
-    reach = min(radius * np.sqrt(square), (1.0 - FAR) * c)
-    if abs(product - c) >= reach:
-        return 1.0 if product > c else 0.0
-    d = (product - c) / reach
-    return float(0.5 + 0.25 * d * (3.0 - d * d))
-
-
-@jit
 def meet(
-    contacts: Floats, between: Numbers, where: Integers, share: Floats, count: int,
-    touching: Integers, point: Floats, loose: Integers, owner: Numbers, weights: Floats, dim: int, c: float,
-) -> int:
-    """The pairs of particles that touch at the loose points; how many pairs there are now, `count` of them before.
-
-    Pair r at point where[r]: between[r] = (a, b), a < b; share[r] = w_p times `touching_share`; contacts[r] = rho,
-    grad rho, eta_a, grad eta_a, eta_b, grad eta_b. Pairs beyond the length of the arrays are counted only. Expects the
-    fields that `potential` left in `point`.
-    """
+    found: Contacts, point: Floats, loose: Integers, owner: Numbers, weights: Floats, touching: Integers, c: float
+) -> None:
+    """Add the particles that touch at the points loose[l], l in touching, to the contacts."""
+    width = found.values.shape[1] // 3
     for l in touching:
-        row = l * (1 + dim)
+        row = l * width
         for s in range(owner.shape[1]):
-            if owner[l, s] < 0 or point[row, 1 + s] <= 0.0:
-                continue
             for t in range(s + 1, owner.shape[1]):
-                if owner[l, t] < 0 or point[row, 1 + s] * point[row, 1 + t] <= FAR * c:
-                    continue
-                r = min(count, share.size - 1)
-                first_column, second_column = (1 + s, 1 + t) if owner[l, s] < owner[l, t] else (1 + t, 1 + s)
-                between[r, 0] = owner[l, first_column - 1]
-                between[r, 1] = owner[l, second_column - 1]
-                where[r] = loose[l]
-                for k in range(1 + dim):
-                    contacts[r, k] = point[row + k, 0]
-                    contacts[r, 1 + dim + k] = point[row + k, first_column]
-                    contacts[r, 2 + 2 * dim + k] = point[row + k, second_column]
-                share[r] = weights[where[r]] * touching_share(contacts, r, weights[where[r]], dim, c)
-                count += share[r] > 0.0
-    return count
-
-
-@jit
-def contact_forces(
-    force: Floats, count: int, contacts: Floats, between: Numbers, where: Integers, share: Floats, x: Floats,
-    m: Coefficients,
-) -> None:
-    """Add b_a w_p and (x_p cross b_a) w_p of every pair that `meet` found to the forces and torques   (25)-(27)
-
-    b_a = k sum_{b != a} (rho - rho_0) [eta_a eta_b > c] (grad eta_a - grad eta_b), the bracket as `touching_share`.
-    force (particles, dim + rotations); x is measured from the origin that `rigid.velocities` moves to the particle's
-    centre.
-    """
-    dim = x.shape[1]
-    push = np.zeros(6)
-    for r in range(count):
-        pull = share[r] * m.k * (contacts[r, 0] - m.rho_0)
-        for k in range(dim):
-            push[k] = pull * (contacts[r, 2 + dim + k] - contacts[r, 3 + 2 * dim + k])
-        turn(push, x, where[r])
-        for k in range(force.shape[1]):
-            force[between[r, 0], k] += push[k]
-            force[between[r, 1], k] -= push[k]
-
-
-@jit
-def contact_stiffness(
-    stiffness: Floats, keys: Integers, count: int, contacts: Floats, between: Numbers, where: Integers, share: Floats,
-    x: Floats, particles: int, m: Coefficients, huang: bool,
-) -> None:
-    """How the contact forces answer to rigid motion: stiffness[pair] += w_p k e_p (d_a, d_b) over the pairs of `meet`.
-
-    Moving particle c with (v, omega) changes rho at x by -(v, omega) . d_c, d_c = (grad q, x cross grad q) with
-    q = rho eta_c^2 [`wang`: rho eta_c]; the force on a is k (rho - rho_0) e, e = (g, x cross g) with
-    g = grad eta_a - grad eta_b.
-    stiffness (pairs, 2, dim + rotations, dim + rotations); keys (pairs,) sorted a particles + b with a < b.
-    """
-    dim = x.shape[1]
-    size = stiffness.shape[2]
-    direction = np.zeros(6)
-    answer_a = np.zeros(6)
-    answer_b = np.zeros(6)
-    for r in range(count):
-        for k in range(dim):
-            direction[k] = contacts[r, 2 + dim + k] - contacts[r, 3 + 2 * dim + k]
-            answer_a[k] = carried_slope(contacts, r, 1 + dim, k, huang)
-            answer_b[k] = carried_slope(contacts, r, 2 + 2 * dim, k, huang)
-        turn(direction, x, where[r])
-        turn(answer_a, x, where[r])
-        turn(answer_b, x, where[r])
-        pair = np.searchsorted(keys, np.int64(between[r, 0]) * particles + between[r, 1])
-        for i in range(size):
-            scaled = share[r] * m.k * direction[i]
-            for j in range(size):
-                stiffness[pair, 0, i, j] += scaled * answer_a[j]
-                stiffness[pair, 1, i, j] += scaled * answer_b[j]
-
-
-@jit
-def carried_slope(contacts: Floats, r: int, column: int, k: int, huang: bool) -> float:
-    """Component k of grad(rho eta^2) [`wang`: grad(rho eta)] for the particle whose eta is in that column."""
-    rho = contacts[r, 0]
-    eta = contacts[r, column]
-    if huang:
-        return float(eta * eta * contacts[r, 1 + k] + 2.0 * rho * eta * contacts[r, column + 1 + k])
-    return float(eta * contacts[r, 1 + k] + rho * contacts[r, column + 1 + k])
-
-
-@jit
-def turn(vector: Floats, x: Floats, p: int) -> None:
-    """Append x_p cross v to v: one number in the plane, three in space."""
-    if x.shape[1] == 2:
-        vector[2] = x[p, 0] * vector[1] - x[p, 1] * vector[0]
-        return
-    vector[3] = x[p, 1] * vector[2] - x[p, 2] * vector[1]
-    vector[4] = x[p, 2] * vector[0] - x[p, 0] * vector[2]
-    vector[5] = x[p, 0] * vector[1] - x[p, 1] * vector[0]
+                a, b = owner[l, s], owner[l, t]
+                if min(a, b) >= 0 and point[row, 1 + s] > 0.0 and point[row, 1 + t] > 0.0:
+                    add_contact(found, point, row, 0, row, 1 + s, row, 1 + t, a, b, loose[l], weights[loose[l]], c)
 
 
 @inlined

@@ -5,12 +5,11 @@ from collections.abc import Callable
 import numpy as np
 
 from . import block_kernels
-from .arrays import Floats, Integers, Numbers
+from .arrays import Floats, Integers
 from .blocks import Blocks, LiveBlocks
+from .contacts import Contacts
 from .discretisation import Discretisation
 from .simd import LANES
-
-Contacts = tuple[Floats, Numbers, Integers, Floats]  # contacts, between, where, share: see `kernels.meet`
 
 
 class Layer:
@@ -27,21 +26,33 @@ class Layer:
         self.W = np.zeros((1, nodes + LANES))
         self.D, self.S2 = np.empty((2, live.blocks.size, LANES))
         self.fields = room(live.column.size * (1 + d.dim))
-        self.touching = np.empty(LANES * live.blocks.size, dtype=np.int64)
-        self.touches = 0
+        self.touching = np.empty(live.blocks.size, dtype=np.int64)
 
     def _range(self, border: bool) -> tuple[int, int]:
         """The live blocks at the border of the rank, or the others."""
         return (0, self.live.border) if border else (self.live.border, self.live.blocks.size)
 
-    def potential(self, border: bool) -> None:
-        """`block_kernels.potential` of the blocks at the border, which come first, or of the others."""
+    def potential(self, found: Contacts, border: bool) -> None:
+        """`block_kernels.potential` of the blocks at the border, which come first, or of the others; their contacts."""
         blocks, live, d = self.blocks, self.live, self.d
-        self.touches = block_kernels.potential(
+        touches = block_kernels.potential(
             self.W, self.touching, self.fields, self.D, self.S2, self.u,
             live.blocks, live.weights, live.first, live.column, live.owner, live.partial,
             blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table, d.coefficients,
-            *self._range(border), 0 if border else self.touches,
+            *self._range(border),
+        )
+        if d.case.model.rigid_motion:
+            self._meet(found, self.touching[:touches])
+
+    def meet(self, found: Contacts, border: bool) -> None:
+        """The contacts of the same again."""
+        self._meet(found, np.arange(*self._range(border)))
+
+    def _meet(self, found: Contacts, touching: Integers) -> None:
+        live = self.live
+        block_kernels.meet(
+            found, self.fields, live.blocks, live.weights, live.first, live.owner, self.blocks.points,
+            touching, self.d.coefficients.c,
         )
 
     def divergence(self, border: bool, motion: Floats) -> None:
@@ -52,12 +63,4 @@ class Layer:
             live.blocks, live.weights, live.first, live.column, live.particle, live.owner,
             blocks.x, blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table,
             d.coefficients, d.case.model.rigid_motion, d.huang, *self._range(border),
-        )
-
-    def meet(self, found: Contacts, count: int) -> int:
-        """`block_kernels.meet` of all."""
-        live, d = self.live, self.d
-        return block_kernels.meet(
-            *found, count, self.touching[: self.touches], self.fields, live.blocks, live.first, live.owner,
-            self.blocks.points, d.weights, d.dim, d.coefficients.c,
         )

@@ -92,7 +92,7 @@ class Relaxation:
 def relaxation(
     stiffness: Floats, order: Plan, moments: Floats, m: Coefficients, tau: float, carried: Floats
 ) -> Relaxation:
-    """The relaxation for a stiffness (pairs, 2, k, k) as `kernels.contact_stiffness` leaves it, summed over ranks."""
+    """The relaxation for a stiffness (pairs, 2, k, k) as `contacts.contact_stiffness` leaves it, summed over ranks."""
     particles, size = len(moments), stiffness.shape[2]
     M = np.empty((particles, size, size))
     for k in range(size):

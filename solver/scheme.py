@@ -10,9 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from . import block_kernels, elimination, kernels, rigid, unknowns
+from . import block_kernels, contacts, elimination, kernels, rigid, unknowns
 from .active import Active, activate
-from .arrays import Floats
+from .arrays import Floats, Integers
 from .discretisation import Discretisation
 from .layers import Layer
 from .simd import LANES
@@ -27,8 +27,8 @@ class Scheme:
         self.particles = len(state.slot_of)
         self.relax: Callable[[Floats], Floats] = lambda motion: motion
         self.motion = np.zeros((self.particles, d.dim + rigid.rotations(d.dim)))
-        self.touches = self.meetings = 0
-        self._make_room(64)
+        self.order = elimination.plan(np.empty((0, 2), dtype=np.int64), self.particles)
+        self.contacts = contacts.room(64, d.dim)
         self.rooms: dict[str, Floats] = {}
         self.activate(state)
 
@@ -56,9 +56,9 @@ class Scheme:
 
         # Loose points: their fields, D and S2; the nodes' fields, and rates (0 between evaluations), by rows
         self.D, self.S2 = np.empty((2, a.loose.size))
+        self.touching = np.empty(a.loose.size, dtype=np.int64)
         self.point = self._room("point", a.loose.size * (1 + d.dim), columns)
         self.u_rows, self.rate_rows = np.zeros((2, d.nodes, columns))
-        self.touching = np.empty(a.loose.size, dtype=np.int64)
         self.work = np.empty((1, d.shape.longest))
         self.velocity = np.zeros((d.dim, columns))
 
@@ -66,7 +66,6 @@ class Scheme:
         size = self.motion.shape[1]
         self.sums = np.zeros((self.particles, size + 1 + d.dim))
         self.forces, self.moments = self.sums[:, :size], self.sums[:, size:]
-        self.order = elimination.plan(a.pairs, self.particles)
         self.carried = self.motion
 
     def _room(self, name: str, rows: int, columns: int) -> Floats:
@@ -94,12 +93,11 @@ class Scheme:
         # Contact forces (25)-(27) and rigid motion (8)-(10): V_a(r) = [ m_t F_a + m_r T_a x (r - r_a) ] / V_a
         watch.enter("rigid motion")
         if moving:
-            self._meet()
             forces, moments = self._bodies(y)
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
                 self.carried = self.motion
-                self.relax = rigid.relaxation(self._stiffness(), self.order, moments, m, tau, self.carried)
+                self.relax = rigid.relaxation(*self._stiffness(), moments, m, tau, self.carried)
             self.motion = self.relax(free)
 
         # Fluxes (20), (21)
@@ -114,17 +112,21 @@ class Scheme:
         work, ranks = np.array([self.active.work()]), self.d.share.ranks
         return float(ranks.max(work.copy())[0] * ranks.size / ranks.sum(work)[0] - 1.0)
 
-    def _stiffness(self) -> Floats:
-        """How the contact forces answer to rigid motion, (pairs, 2, k, k) summed over the ranks, after `_meet`."""
+    def _stiffness(self) -> tuple[Floats, elimination.Plan]:
+        """How the contact forces answer to rigid motion, after `_gather`: (pairs, 2, k, k) summed over the ranks, for
+        the pairs that push each other; and the elimination for these."""
         d, a = self.d, self.active
         size = self.motion.shape[1]
         stiffness = np.zeros((len(a.pairs), 2, size, size))
         keys = a.pairs[:, 0] * self.particles + a.pairs[:, 1]
-        kernels.contact_stiffness(
-            stiffness, keys, self.meetings, self.contacts, self.between, self.where, self.share, d.x,
-            self.particles, d.coefficients, d.huang,
+        contacts.contact_stiffness(
+            stiffness, keys, self.contacts, d.x, self.particles, d.coefficients, d.huang
         )
-        return d.share.ranks.sum(stiffness)
+        d.share.ranks.sum(stiffness)
+        pushing = stiffness.any(axis=(1, 2, 3))
+        if not np.array_equal(a.pairs[pushing], self.order.pairs):
+            self.order = elimination.plan(a.pairs[pushing], self.particles)
+        return stiffness[pushing], self.order
 
     def _gather(self, y: Floats) -> None:
         """Fields and D of this rank's points in the work arrays, and W summed over the ranks."""
@@ -134,21 +136,26 @@ class Scheme:
             block_kernels.fetch(layer.u, self.main.u, layer.at)
             layer.W[:] = 0.0
         kernels.start(self.W, a.potential, a.nodes)
+        self.contacts.number[0] = 0
         self._potential(border=True)
         under_way = d.share.halo.start(self.W)  # what goes to shared nodes is complete; the rest is done meanwhile
         self._potential(border=False)
+        if self.contacts.number[0] > self.contacts.share.size:
+            self._meet_again()
         d.share.halo.finish(self.W, under_way)
 
     def _potential(self, border: bool) -> None:
         """The part of `_gather` for the points at the border of the rank, or for the others."""
         d, a, table = self.d, self.active, self.d.shape
-        self.touches = kernels.potential(
+        touches = kernels.potential(
             self.W, self.touching, self.point, self.D, self.S2, self.u_rows, a.loose, a.mask, a.present, a.several,
             d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
-            *self._range(border), 0 if border else self.touches,
+            *self._range(border),
         )
+        if d.case.model.rigid_motion:
+            self._meet(self.touching[:touches])
         for layer in self.layers:
-            layer.potential(border)
+            layer.potential(self.contacts, border)
             block_kernels.give(self.main.W, layer.W, layer.at)
 
     def _scatter(self, rate: Floats) -> None:
@@ -186,34 +193,24 @@ class Scheme:
         """The loose points at the border of the rank, or the others."""
         return (0, self.active.loose_border) if border else (self.active.loose_border, self.active.loose.size)
 
-    def _meet(self) -> None:
-        """The pairs of particles that touch at this rank's points, after `_gather`; room for more is made if needed."""
-        d, a = self.d, self.active
-        while True:
-            found = self.contacts, self.between, self.where, self.share
-            touching = self.touching[: self.touches]
-            count = kernels.meet(*found, 0, touching, self.point, a.loose, a.owner, d.weights, d.dim, d.coefficients.c)
-            for layer in self.layers:
-                count = layer.meet(found, count)
-            self.meetings = count
-            if count < len(self.share):
-                return
-            self._make_room(2 * count)
+    def _meet(self, touching: Integers) -> None:
+        """Add the contacts of loose points."""
+        a, d = self.active, self.d
+        kernels.meet(self.contacts, self.point, a.loose, a.owner, d.weights, touching, d.coefficients.c)
 
-    def _make_room(self, pairs: int) -> None:
-        """For that many pairs that touch at a point."""
-        self.contacts = np.empty((pairs, 3 * (1 + self.d.dim)))
-        self.between = np.empty((pairs, 2), dtype=np.int32)
-        self.where = np.empty(pairs, dtype=np.int64)
-        self.share = np.empty(pairs)
+    def _meet_again(self) -> None:
+        """All contacts, in the same order, in more room: there was not enough."""
+        self.contacts = contacts.room(2 * int(self.contacts.number[0]), self.d.dim)
+        for border in (True, False):
+            self._meet(np.arange(*self._range(border)))
+            for layer in self.layers:
+                layer.meet(self.contacts, border)
 
     def _bodies(self, y: Floats) -> tuple[Floats, Floats]:
-        """Contact forces and moments of all particles, summed over the ranks, after `_meet`."""
+        """Contact forces and moments of all particles, summed over the ranks, after `_gather`."""
         d, a = self.d, self.active
         self.sums[:] = 0.0
-        kernels.contact_forces(
-            self.forces, self.meetings, self.contacts, self.between, self.where, self.share, d.x, d.coefficients
-        )
+        contacts.contact_forces(self.forces, self.contacts, d.x, d.coefficients)
         self.moments += a.moments
         unknowns.add_moments(self.moments, y, d.mass, d.first_moment, a.unknowns.strips)
         d.share.ranks.sum(self.sums)

@@ -84,6 +84,25 @@ def test_every_particle_goes_once_and_later_ones_later(graph: Graph) -> None:
     assert coupled == [{who[e], found.later[e]} for e in found.target]
 
 
+@given(graphs())
+@settings(max_examples=60, deadline=None)
+def test_the_one_with_the_fewest_partners_is_next(graph: Graph) -> None:
+    """Against the same with sets: the order, and who is left for each to be eliminated from."""
+    pairs, particles = graph
+    meets: list[set[int]] = [set() for _ in range(particles)]
+    for a, b in pairs.tolist():
+        meets[a].add(b)
+        meets[b].add(a)
+    found = plan(pairs, particles)
+    left = set(range(particles))
+    for i, pivot in enumerate(found.pivots.tolist()):
+        assert pivot == min(left, key=lambda a: (len(meets[a]), a))
+        assert set(found.later[found.first[i] : found.first[i + 1]].tolist()) == meets[pivot]
+        left.remove(pivot)
+        for b in meets[pivot]:
+            meets[b] = (meets[b] | meets[pivot]) - {pivot, b}
+
+
 def entries(found: Plan) -> int:
     return int(found.first[-1])
 

@@ -8,9 +8,10 @@ import pytest
 import reference
 from simulate import rates_of
 
-from frit.solver import active, kernels
+from frit.solver import active
 from frit.solver.arrays import Floats
 from frit.solver.case import Case, parse_case
+from frit.solver.contacts import touching_share
 from frit.solver.geometry import Mesh
 from frit.solver.observe import free_energy
 from frit.solver.partition import Ranks
@@ -234,7 +235,6 @@ def test_relaxed_contacts_are_an_implicit_step_of_the_forces(ranks: Ranks, dim: 
 def test_the_touching_share_is_the_cut_of_a_ball() -> None:
     """In space: the part of a ball, whose volume is the cell's, on one side of a plane, by slices across the plane."""
     eta, slope, w = np.array([0.4, 0.3]), np.array([[0.05, 0.02, 0.0], [-0.02, 0.07, 0.05]]), 0.7
-    contact = np.concatenate([[1.0, 0.0, 0.0, 0.0], eta[:1], slope[0], eta[1:], slope[1]])[None]
     gradient = eta[0] * slope[1] + eta[1] * slope[0]
     steepness, radius = np.linalg.norm(gradient), (w / (4 / 3 * np.pi)) ** (1 / 3)
     for height in (-1.2, -1.0, -0.6, -0.1, 0.0, 0.3, 0.9, 1.0, 1.2):
@@ -242,7 +242,7 @@ def test_the_touching_share_is_the_cut_of_a_ball() -> None:
         z = np.linspace(-1.0, 1.0, 200_001)
         slices = np.pi * (1.0 - z**2) * (z > -height)
         exact = np.trapezoid(slices, z) / (4 / 3 * np.pi)
-        assert kernels.touching_share(contact, 0, w, 3, level) == pytest.approx(exact, abs=2e-5)
+        assert touching_share(eta.prod(), gradient @ gradient, w, 3, level) == pytest.approx(exact, abs=2e-5)
         given = reference.touching_share(eta[:1], eta[1:], slope[:1], slope[1:], np.array([w]), level)
         assert given[0] == pytest.approx(exact, abs=2e-5)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import block_kernels, kernels, slots, unknowns
+from . import block_kernels, kernels, slots, unknowns, vectors
 from .arrays import Array, Bytes, Flags, Floats, Integers, Numbers
 from .block_kernels import SMALLEST
 from .blocks import LiveBlocks, live_blocks
@@ -56,9 +56,9 @@ class Active:
         blocks = sum(FIXED_WORK * live.blocks.size + live.column.size for live in (self.blocks, self.upright))
         return float(blocks + 2.0 * (FIXED_WORK * self.loose.size + self.present.sum()))
 
-    def stale(self, u: Floats) -> float:
+    def stale(self, y: Floats) -> float:
         """Largest movement of a watched value, in units of its eps; `run.LAG` says when it is too much."""
-        return float(unknowns.largest_change(u, self.reference, self.watch, self.unknowns.strips))
+        return float(vectors.largest_change(y, self.reference, self.watch))
 
 
 def activate(d: Discretisation, state: State) -> Active:

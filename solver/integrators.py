@@ -21,6 +21,7 @@ class Integrator(Protocol):
     """What the run needs of a method."""
 
     stops_at_events: bool  # whether a step must end at each output time, or `at` interpolates
+    y: Floats  # the state's unknowns
 
     def step(self, scheme: Scheme, state: State, limit: float) -> None:
         """Advance the state by one step, not beyond `limit`."""

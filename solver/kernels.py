@@ -610,14 +610,3 @@ def divide_values(array: Floats, mass: Floats, listed: Integers) -> None:
     """array[a] /= m_a at the listed nodes, one value each."""
     for i in range(listed.size):
         array[listed[i]] /= mass[listed[i]]
-
-
-@jit
-def first_outside(u: Floats, listed: Integers, at_wall: Flags, low: float, high: float, rho_at_wall: float) -> int:
-    """The first listed node with a field outside [low, high] or not a number, or -1; for rho at walls high differs."""
-    for i in range(listed.size):
-        a = listed[i]
-        for c in range(u.shape[1]):
-            if not (low <= u[a, c] <= (rho_at_wall if c == 0 and at_wall[a] else high)):
-                return int(a)
-    return -1

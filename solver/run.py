@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from . import kernels
+from . import unknowns
 from .arrays import Floats
 from .case import Case
 from .integrators import Integrator
@@ -92,7 +92,7 @@ def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer
         limit = waiting[0].time if integrator.stops_at_events else waiting[-1].time
         if state.time < waiting[0].time:
             integrator.step(scheme, state, limit)
-            check(scheme, state)
+            check(scheme, state, integrator.y)
         for event in reached(waiting, state.time):
             with watch("output"):
                 u = integrator.at(scheme, state, event.time) if state.step else state.u
@@ -100,7 +100,7 @@ def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer
                     observer.history(scheme, state, u, event.time)
                 if event.snapshot is not None:
                     observer.snapshot(event.snapshot, scheme, state, u, event.time)
-        if renewed := renew(scheme, state):
+        if renewed := renew(scheme, state, integrator.y):
             integrator.restart(scheme, state)
         with watch("output"):
             ended = observer.after_step(scheme, state, integrator)
@@ -117,7 +117,7 @@ def reached(waiting: list[Event], time: float) -> Iterator[Event]:
         yield waiting.pop(0)
 
 
-def renew(scheme: Scheme, state: State) -> bool:
+def renew(scheme: Scheme, state: State, y: Floats) -> bool:
     """Make the set of live points anew when a value that it rests on has moved, and every `REFRESH` steps.
 
     True where that happened: rates computed before no longer hold. Collective.
@@ -125,7 +125,7 @@ def renew(scheme: Scheme, state: State) -> bool:
     switch = scheme.d.case.activation
     if state.step == 0 or not (switch.enabled or switch.few_order_parameters):
         return False
-    moved = np.array([scheme.active.stale(state.u)])
+    moved = np.array([scheme.active.stale(y)])
     scheme.d.share.ranks.max(moved)
     if moved[0] < LAG and state.step % REFRESH:
         return False
@@ -133,10 +133,10 @@ def renew(scheme: Scheme, state: State) -> bool:
     return True
 
 
-def check(scheme: Scheme, state: State) -> None:
-    """Raise RunError on every rank where a field is not a number or outside its range. Collective."""
+def check(scheme: Scheme, state: State, y: Floats) -> None:
+    """Raise RunError on every rank where a value of y, the state's unknowns, is none or outside its range. Collective."""
     d = scheme.d
-    bad = kernels.first_outside(state.u, scheme.active.nodes, d.at_wall, LOWEST, HIGHEST, HIGHEST_AT_WALL)
+    bad = unknowns.first_outside(y, scheme.active.unknowns.strips, d.at_wall, LOWEST, HIGHEST, HIGHEST_AT_WALL)
     worst = d.share.ranks.max(np.array([-1.0 if bad < 0 else float(d.share.nodes[bad])]))
     if worst[0] < 0.0:
         return

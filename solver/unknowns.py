@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import Floats, Integers, Numbers
+from .arrays import Flags, Floats, Integers, Numbers
 from .jit import jit
 from .partition import Halo
 from .simd import flush_denormals, restore_denormals
@@ -192,12 +192,13 @@ def step_error(
 
 
 @jit
-def largest_change(u: Floats, reference: Floats, weight: Floats, strips: Strips) -> float:
-    """max weight |u - reference| over the unknowns: fields u (n, F), reference and weight (y,)."""
-    largest = 0.0
+def first_outside(y: Floats, strips: Strips, at_wall: Flags, low: float, high: float, rho_at_wall: float) -> int:
+    """The first node with a field outside [low, high] or not a number, or -1; for rho at walls high differs."""
+    found = at_wall.size
     for r in range(strips.node.size):
-        begin = strips.first[r]
+        rho = strips.particle[r] < 0
+        begin, a = strips.first[r], strips.node[r]
         for k in range(strips.first[r + 1] - begin):
-            change = abs(u[strips.node[r] + k, strips.column[r]] - reference[begin + k])
-            largest = max(largest, weight[begin + k] * change)
-    return largest
+            if not (low <= y[begin + k] <= (rho_at_wall if rho and at_wall[a + k] else high)):
+                found = min(found, a + k)
+    return int(found) if found < at_wall.size else -1

@@ -37,3 +37,12 @@ def hermite(
     h11 = theta * theta * (theta - 1.0) * dt
     for i in range(new.size):
         new[i] = h00 * old[i] + h10 * rate_0[i] + h01 * y[i] + h11 * rate_1[i]
+
+
+@jit
+def largest_change(y: Floats, reference: Floats, weight: Floats) -> float:
+    """max weight |y - reference|, 0 of nothing."""
+    largest = 0.0
+    for i in range(y.size):
+        largest = max(largest, weight[i] * abs(y[i] - reference[i]))
+    return largest

@@ -209,19 +209,20 @@ def test_a_step_far_too_long_ends_with_time_place_and_cause(ranks: Ranks, rigid:
 @pytest.mark.parametrize("column", [0, 1, 2])
 def test_a_single_bad_value_is_found(ranks: Ranks, value: float, column: int) -> None:
     _, scheme, state = start(discs(), ranks)
-    node = int(np.flatnonzero(~scheme.d.at_wall)[41])
+    there = state.owner[:, column - 1] >= 0 if column else np.ones(len(state.u), dtype=bool)
+    node = int(np.flatnonzero(~scheme.d.at_wall & there)[41])
     state.u[node, column] = value
     with pytest.raises(RunError, match=f"node {node} at "):
-        check(scheme, state)
+        check(scheme, state, scheme.active.unknowns.take(state.u))
 
 
 def test_values_at_the_limits_pass(ranks: Ranks) -> None:
     _, scheme, state = start(discs(), ranks)
-    check(scheme, state)
+    check(scheme, state, scheme.active.unknowns.take(state.u))
     inside, wall = np.flatnonzero(~scheme.d.at_wall), np.flatnonzero(scheme.d.at_wall)
     state.u[inside[:2], 0], state.u[inside[2], 1] = (1.5, -0.5), 1.5
     state.u[wall[:2], 0], state.u[wall[2], 1] = (3.0, -0.5), 1.5
-    check(scheme, state)
+    check(scheme, state, scheme.active.unknowns.take(state.u))
 
 
 @pytest.mark.parametrize(("column", "value"), [(0, 3.0001), (0, -0.5001), (0, float("nan")), (1, 1.5001)])
@@ -231,7 +232,7 @@ def test_there_are_limits_at_walls_too(ranks: Ranks, column: int, value: float) 
     state.u[node, column] = value
     limits = rf"\[-0\.5, 3\]; likely cause: {PRESSED}, or" if value > 3.0 else r"\[-0\.5, 1\.5\]; likely cause:"
     with pytest.raises(RunError, match=rf"node {node} at .* left {limits} {CAUSE}"):
-        check(scheme, state)
+        check(scheme, state, scheme.active.unknowns.take(state.u))
 
 
 def test_walls_are_the_nodes_within_a_spacing(ranks: Ranks) -> None:

@@ -155,8 +155,8 @@ def in_turns() -> None:
             began = time.monotonic()
             if number > 0 or world.root:
                 integrator.step(scheme, state, case.time.end)
-                check(scheme, state)
-                if renew(scheme, state):
+                check(scheme, state, integrator.y)
+                if renew(scheme, state, integrator.y):
                     integrator.restart(scheme, state)
             wait(world)
             seconds[-1].append(time.monotonic() - began)

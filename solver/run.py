@@ -134,7 +134,7 @@ def renew(scheme: Scheme, state: State, y: Floats) -> bool:
 
 
 def check(scheme: Scheme, state: State, y: Floats) -> None:
-    """Raise RunError on every rank where a value of y, the state's unknowns, is none or outside its range. Collective."""
+    """Raise RunError on every rank where a value of y, the state's unknowns, is none or out of range. Collective."""
     d = scheme.d
     bad = unknowns.first_outside(y, scheme.active.unknowns.strips, d.at_wall, LOWEST, HIGHEST, HIGHEST_AT_WALL)
     worst = d.share.ranks.max(np.array([-1.0 if bad < 0 else float(d.share.nodes[bad])]))

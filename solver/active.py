@@ -6,6 +6,7 @@ change its neighbours: it shares nodes with live points, and those nodes need it
 `Active.stale` watches exactly those values; the set is made anew when one has moved by `run.LAG` eps.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from . import block_kernels, kernels, slots, unknowns, vectors
 from .arrays import Array, Bytes, Flags, Floats, Integers, Numbers
 from .block_kernels import SMALLEST
-from .blocks import LiveBlocks, live_blocks
+from .blocks import Blocks, LiveBlocks, live_blocks
 from .discretisation import FIXED_WORK, WORTH, Discretisation
 from .rigid import rotations
 from .simd import LANES
@@ -61,12 +62,15 @@ class Active:
         return float(vectors.largest_change(y, self.reference, self.watch))
 
 
-def activate(d: Discretisation, state: State) -> Active:
+Room = Callable[[int, int], Floats]  # work space of so many rows and columns, valid until the next is asked for
+
+
+def activate(d: Discretisation, state: State, room: Room = lambda rows, columns: np.empty((rows, columns))) -> Active:
     """Make the set for the state. A particle's order parameter is set to zero at nodes that no point sees where it
     exists (`LEAST`), and slots are moved where particles that shared one have come close. Collective; the result does
     not depend on the number of ranks.
     """
-    flags, owner, pairs = _settle(d, state)
+    flags, owner, pairs = _settle(d, state, room)
     if _worth(d, flags):
         pairs = None  # those at live points alone are wanted
     else:
@@ -114,7 +118,7 @@ def activate(d: Discretisation, state: State) -> Active:
         drift=drift,
         moments=moments,
         reference=moved.take(state.u),
-        watch=_watch(d, flags, owner, state.owner, moved),
+        watch=_watch(d, flags, owner, state.owner, moved, [blocks, upright], loose),
     )
 
 
@@ -124,7 +128,7 @@ def _worth(d: Discretisation, flags: Numbers) -> bool:
     return bool(counts[0] <= WORTH * counts[1])
 
 
-def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers | None]:
+def _settle(d: Discretisation, state: State, room: Room) -> tuple[Numbers, Numbers, Integers | None]:
     """Flags and slot owners of the points, once every particle has its slot to itself wherever a live point looks; and
     the pairs of particles that meet at any point of any rank, where somebody asked.
 
@@ -136,12 +140,12 @@ def _settle(d: Discretisation, state: State) -> tuple[Numbers, Numbers, Integers
     flags = np.zeros(points, dtype=np.int32)
     owner = np.full((points, state.owner.shape[1]), -1, dtype=np.int32)
     clash = np.full((points, 2), -1, dtype=np.int64)
-    owners = np.empty((2, 0, 0))
     changed = np.ones(d.nodes, dtype=bool)  # nodes whose values or owners a point has not been asked about yet
     while True:
-        if owners.shape[1] != owner.shape[1]:
-            owners = np.empty((2, owner.shape[1], d.nodes + LANES))
-        _sense(d, state, flags, owner, clash, changed, owners)
+        columns, those = state.u.shape[1], owner.shape[1]
+        work = room(columns + 2 * those, d.nodes + LANES)
+        owners = work[columns:].reshape(2, those, -1)
+        _sense(d, state, flags, owner, clash, changed, owners, work[:columns])
         if not d.case.activation.enabled:
             flags[:] = 1
         if not d.case.activation.few_order_parameters:
@@ -184,14 +188,18 @@ def _claim(d: Discretisation, owner: Numbers, clash: Integers, owners: Floats) -
 
     owners: work space, as for `_sense`.
     """
-    near, blocks, table = d.nearest, d.blocks, d.shape
+    near, table = d.nearest, d.shape
     high, low = owners
     high[:], low[:] = -1.0, block_kernels.NOBODY
-    block_kernels.claim(
-        high, low, owner, blocks.points, blocks.begin, table.nodes, near.kind, near.starts, near.places
-    )
+    for blocks in (d.blocks, d.upright):
+        largest, smallest = _seen(high, blocks), _seen(low, blocks)
+        block_kernels.claim(
+            largest, smallest, owner, blocks.points, blocks.begin, blocks.nodes, near.kind, near.starts, near.places
+        )
+        if blocks.at.size:
+            high[:, blocks.at], low[:, blocks.at] = largest[:, :-LANES], smallest[:, :-LANES]
     kernels.claim(
-        high, low, owner, blocks.loose, table.offsets, table.nodes, near.kind, near.starts, near.places
+        high, low, owner, d.upright.loose, table.offsets, table.nodes, near.kind, near.starts, near.places
     )
     claims, lowest = np.empty((2, d.nodes, owner.shape[1]), dtype=np.int32)
     block_kernels.by_node(claims, high)
@@ -202,30 +210,40 @@ def _claim(d: Discretisation, owner: Numbers, clash: Integers, owners: Floats) -
 
 
 def _sense(
-    d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers, changed: Flags, owners: Floats
+    d: Discretisation, state: State, flags: Numbers, owner: Numbers, clash: Integers, changed: Flags,
+    owners: Floats, columns: Floats,
 ) -> None:
     """Fill flags, owner and clash at the points that see a changed node; see `kernels.sense`.
 
-    owners (2, slots, n + LANES) is work space, for the largest and the smallest particle of each slot and node.
+    Work space: owners (2, slots, n + LANES) for the largest and the smallest particle of each slot and node, columns
+    (F, n + LANES) for the fields.
     """
-    table, near, blocks, switch = d.shape, d.nearest, d.blocks, d.case.activation
+    table, near, switch = d.shape, d.nearest, d.case.activation
     least = LEAST * switch.eps_eta
     kernels.sense(
-        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, least, d.dim, blocks.loose, changed,
-        table.offsets, table.nodes, table.rows, table.table, near.kind, near.starts, near.places,
+        flags, owner, clash, state.u, state.owner, switch.eps_rho, switch.eps_eta, least, d.dim, d.upright.loose,
+        changed, table.offsets, table.nodes, table.rows, table.table, near.kind, near.starts, near.places,
     )
-    columns = np.zeros((state.u.shape[1], d.nodes + LANES))
-    block_kernels.to_columns(columns, state.u, np.arange(d.nodes))
-    high, low = owners
-    high[:], low[:] = -1.0, block_kernels.NOBODY
-    block_kernels.by_column(high, low, state.owner)
+    block_kernels.to_columns(columns, state.u)
+    block_kernels.by_column(owners[0], owners[1], state.owner)
     # |sum N u| and |sum grad N u| are at most max |u| times the largest sum of |N| or of |grad N| in a row of the table
     negligible = min(least, switch.eps_eta) / d.steepest
-    block_kernels.sense(
-        flags, owner, clash, columns, high, low, switch.eps_rho, switch.eps_eta, least, negligible, blocks.points,
-        changed, blocks.begin, blocks.count, blocks.start, table.nodes, table.table,
-        near.kind, near.starts, near.places,
-    )
+    for blocks in (d.blocks, d.upright):
+        block_kernels.sense(
+            flags, owner, clash, _seen(columns, blocks), _seen(owners[0], blocks), _seen(owners[1], blocks),
+            switch.eps_rho, switch.eps_eta, least, negligible, blocks.points,
+            changed[blocks.at] if blocks.at.size else changed,
+            blocks.begin, blocks.count, blocks.start, blocks.nodes, table.table, near.kind, near.starts, near.places,
+        )
+
+
+def _seen(columns: Floats, blocks: Blocks) -> Floats:
+    """Fields by columns as the blocks number the nodes: for upright ones a copy."""
+    if not blocks.at.size:
+        return columns
+    fields = np.zeros((len(columns), blocks.at.size + LANES))
+    block_kernels.fetch(fields, columns, blocks.at)
+    return fields
 
 
 def _everyones_pairs(d: Discretisation, pairs: Integers) -> Integers:
@@ -241,12 +259,25 @@ def _spread(d: Discretisation, low: Array, high: Array) -> None:
     np.negative(low, out=low)
 
 
-def _watch(d: Discretisation, flags: Numbers, owner: Numbers, node_owner: Numbers, moved: Unknowns) -> Floats:
+def _watch(
+    d: Discretisation, flags: Numbers, owner: Numbers, node_owner: Numbers, moved: Unknowns, lives: list[LiveBlocks],
+    loose: Integers,
+) -> Floats:
     """1 / eps of the unknowns that decide whether the set still holds, 0 of the others."""
-    watch, table, switch = np.zeros(d.nodes, dtype=np.int64), d.shape, d.case.activation
+    watch, owned = np.zeros((2, d.nodes), dtype=np.int64)
+    table, near, switch = d.shape, d.nearest, d.case.activation
+    kernels.all_slots(owned, node_owner)
+    for blocks, live in zip((d.blocks, d.upright), lives, strict=True):
+        bits, here = (watch, owned) if not blocks.at.size else (watch[blocks.at], owned[blocks.at])
+        block_kernels.watch_nodes(
+            bits, here, live.blocks, live.weights, live.first, live.column, live.owner, blocks.points,
+            blocks.begin, blocks.start, blocks.nodes, table.table, near.kind, near.starts, near.places,
+        )
+        if blocks.at.size:
+            watch[blocks.at] = bits
     kernels.watch_nodes(
-        watch, flags, owner, node_owner, table.offsets, table.nodes, table.rows, table.table,
-        d.nearest.kind, d.nearest.starts, d.nearest.places,
+        watch, flags, owner, owned, table.offsets, table.nodes, table.rows, table.table,
+        near.kind, near.starts, near.places, np.concatenate([loose, np.flatnonzero(flags == 0)]),
     )
     column = np.repeat(moved.strips.column, np.diff(moved.strips.first))
     bits = watch[moved.nodes]

@@ -520,25 +520,52 @@ def by_node(values: Numbers, columns: Floats) -> None:
 
 @jit
 def by_column(high: Floats, low: Floats, node_owner: Numbers) -> None:
-    """high[s, a] and low[s, a] = node_owner[a, s]; where that is -1, they stay."""
-    for a in range(node_owner.shape[0]):
+    """high[s, a] and low[s, a] (slots, n + LANES) = node_owner[a, s], or -1 and `NOBODY` where that is -1."""
+    n = node_owner.shape[0]
+    for some in range(0, n, 256):  # what is read of `node_owner` is still at hand for the next slot
         for s in range(node_owner.shape[1]):
-            if node_owner[a, s] >= 0:
+            for a in range(some, min(some + 256, n)):
                 high[s, a] = node_owner[a, s]
-                low[s, a] = node_owner[a, s]
+                low[s, a] = node_owner[a, s] if node_owner[a, s] >= 0 else NOBODY
+    high[:, n:], low[:, n:] = -1.0, NOBODY
 
 
 @jit
-def to_columns(columns: Floats, u: Floats, listed: Integers) -> None:
-    """columns[c, a] = u[a, c] at the listed nodes, eight at a time where they follow one another."""
+def watch_nodes(
+    watch: Integers, owned: Integers, blocks: Integers, live_weights: Floats, first: Integers, column: Numbers,
+    owner: Numbers, points: Numbers, begins: Integers, block_starts: Integers, nodes: Numbers, table: Floats,
+    kind: Integers, starts: Integers, places: Numbers,
+) -> None:
+    """`kernels.watch_nodes` for the live points in blocks; owned[a]: `kernels.slots_of` node a."""
+    missing = np.empty(LANES, dtype=np.int64)
+    for l in range(blocks.size):
+        b = blocks[l]
+        for j in range(LANES):
+            missing[j] = -1 if live_weights[l, j] > 0.0 else 0
+        for e in range(first[l] + 1, first[l + 1]):
+            here = np.int64(1) << np.int64(column[e])
+            for j in range(LANES):
+                if owner[e, j] >= 0:
+                    missing[j] &= ~here
+        pattern = kind[points[b, 0]]
+        largest = table[0, block_starts[b] + places[starts[pattern]]]
+        for e in range(starts[pattern], starts[pattern + 1]):
+            if table[0, block_starts[b] + places[e]] < 0.5 * largest:
+                break
+            a = nodes[begins[b] + places[e]]
+            for j in range(min(LANES, owned.size - a)):
+                watch[a + j] |= owned[a + j] & missing[j]
+
+
+@jit
+def to_columns(columns: Floats, u: Floats) -> None:
+    """columns (F, n + LANES) = u (n, F) with rows and columns exchanged, and 0 in the last LANES columns."""
+    n = u.shape[0]
     for c in range(0, u.shape[1], LANES):
-        i = 0
-        while i < listed.size:
-            a = listed[i]
-            if i + LANES <= listed.size and listed[i + LANES - 1] == a + LANES - 1:
-                transpose(u, a, c, columns, c, a)
-                i += LANES
-            else:
-                for k in range(LANES):
-                    columns[c + k, a] = u[a, c + k]
-                i += 1
+        for a in range(0, n - n % LANES, LANES):
+            transpose(u, a, c, columns, c, a)
+        for k in range(c, c + LANES):
+            for a in range(n - n % LANES, n):
+                columns[k, a] = u[a, k]
+            for a in range(n, n + LANES):
+                columns[k, a] = 0.0

@@ -419,20 +419,19 @@ def interior_slot(
 
 @jit
 def watch_nodes(
-    watch: Integers, flags: Numbers, owner: Numbers, node_owner: Numbers,
+    watch: Integers, flags: Numbers, owner: Numbers, owned: Integers,
     offsets: Integers, nodes: Numbers, rows: Integers, table: Floats,
-    kind: Integers, starts: Integers, places: Numbers,
+    kind: Integers, starts: Integers, places: Numbers, listed: Integers,
 ) -> None:
     """watch[a]: bit 0 where a switched-off point needs node a, bit 1 + s where a live point near it lacks slot s.
+
+    Of the listed points; owned[a]: `slots_of` node a.
 
     These nodal values decide whether the set of live points and slots still holds. A node counts as near where its
     N_a(x_p) is at least half the largest of the point: farther ones say little of the slot's value there. A slot that
     exists at the point is the same particle's at the nodes near it.
     """
-    owned = np.zeros(node_owner.shape[0], dtype=np.int64)
-    for a in range(owned.size):
-        owned[a] = slots_of(node_owner, a)
-    for p in range(flags.size):
+    for p in listed:
         if not flags[p]:
             for e in range(offsets[p], offsets[p + 1]):
                 watch[nodes[e]] |= 1
@@ -444,6 +443,13 @@ def watch_nodes(
                 break
             a = nodes[offsets[p] + places[e]]
             watch[a] |= owned[a] & missing
+
+
+@jit
+def all_slots(owned: Integers, owner: Numbers) -> None:
+    """`slots_of` every row."""
+    for i in range(owned.size):
+        owned[i] = slots_of(owner, i)
 
 
 @inlined

@@ -72,8 +72,8 @@ def free_energy(d: Discretisation, u: Floats) -> float:
     loose = kernels.free_energy(
         u, d.weights, d.dim, blocks.loose, table.offsets, table.nodes, table.rows, table.table, d.coefficients
     )
-    columns = np.zeros((u.shape[1], d.nodes + LANES))
-    block_kernels.to_columns(columns, u, np.arange(d.nodes))
+    columns = np.empty((u.shape[1], d.nodes + LANES))
+    block_kernels.to_columns(columns, u)
     return loose + block_kernels.free_energy(
         columns, blocks.points, d.weights, blocks.begin, blocks.count, blocks.start, table.nodes, table.table,
         d.coefficients,

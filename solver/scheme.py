@@ -42,7 +42,7 @@ class Scheme:
             self._activate(state)
 
     def _activate(self, state: State) -> None:
-        self.active: Active = activate(self.d, state)
+        self.active: Active = activate(self.d, state, partial(self._room, "along"))
         d, a, columns = self.d, self.active, state.u.shape[1]
         self.slot_of = state.slot_of
 

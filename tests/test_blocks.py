@@ -210,18 +210,14 @@ def test_what_is_too_small_becomes_zero_in_kernels_and_nowhere_else() -> None:
         assert np.array([tiny])[0] * 0.5 == 5e-311  # numpy, and Python, go on as before
 
 
+@pytest.mark.parametrize("nodes", [3, 200, 205])
 @pytest.mark.parametrize("columns", [8, 24])
-def test_fields_by_columns_are_those_by_nodes_at_listed_nodes_only(columns: int) -> None:
-    """Runs of nodes of every length: eight at a time where that many follow one another, singly elsewhere."""
-    rng = np.random.default_rng(3)
-    u = rng.standard_normal((200, columns))
-    gone = np.cumsum(np.arange(1, 19))  # between them runs of 1, 2, ... 17 nodes
-    listed = np.setdiff1d(np.arange(200), gone)
-    by_columns = np.full((columns, 200 + LANES), 7.0)
-    block_kernels.to_columns(by_columns, u, listed)
-    np.testing.assert_array_equal(by_columns[:, listed], u[listed].T)
-    by_columns[:, listed] = 7.0
-    assert (by_columns == 7.0).all()
+def test_fields_by_columns_are_those_by_nodes(columns: int, nodes: int) -> None:
+    """Eight nodes at a time, and what is left singly; behind them zeros."""
+    u = np.random.default_rng(3).standard_normal((nodes, columns))
+    by_columns = np.full((columns, nodes + LANES), 7.0)
+    block_kernels.to_columns(by_columns, u)
+    np.testing.assert_array_equal(by_columns, np.vstack([u, np.zeros((LANES, columns))]).T)
 
 
 # --- what a rank has to do

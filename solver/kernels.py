@@ -592,7 +592,7 @@ def renumber(nodes: Numbers, new: Numbers) -> None:
 
 @jit
 def variation(varies: Flags, fields: Numbers, cells: Numbers, u: Floats, least: Floats, eps: float) -> None:
-    """Of each cell c: whether a field differs by more than least[c] between two corners; and how many exceed eps."""
+    """Of each cell c: whether a field differs by more than least[c] between its corners; and the number of rho and those above eps."""
     for c in range(cells.shape[0]):
         for column in range(u.shape[1]):
             low = u[cells[c, 0], column]
@@ -601,7 +601,7 @@ def variation(varies: Flags, fields: Numbers, cells: Numbers, u: Floats, least: 
                 low = min(low, u[cells[c, k], column])
                 high = max(high, u[cells[c, k], column])
             varies[c] |= high - low > least[c]
-            fields[c] += high > eps
+            fields[c] += column == 0 or high > eps
 
 
 @jit

@@ -592,7 +592,7 @@ def renumber(nodes: Numbers, new: Numbers) -> None:
 
 @jit
 def variation(varies: Flags, fields: Numbers, cells: Numbers, u: Floats, least: Floats, eps: float) -> None:
-    """Of each cell c: whether a field differs by more than least[c] between its corners; and the number of rho and those above eps."""
+    """Of each cell c: whether a field differs by more than least[c] in it; how many fields: rho, those above eps."""
     for c in range(cells.shape[0]):
         for column in range(u.shape[1]):
             low = u[cells[c, 0], column]

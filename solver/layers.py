@@ -9,7 +9,10 @@ from .arrays import Floats, Integers
 from .blocks import Blocks, LiveBlocks
 from .contacts import Contacts
 from .discretisation import Discretisation
+from .partition import Exchange, pieces
 from .simd import LANES
+
+PIECE = 1000  # blocks between two looks after what is under way: half a millisecond in the plane, two in space
 
 
 class Layer:
@@ -28,39 +31,37 @@ class Layer:
         self.fields = room(live.column.size * (1 + d.dim))
         self.touching = np.empty(live.blocks.size, dtype=np.int64)
 
-    def _range(self, border: bool) -> tuple[int, int]:
-        """The live blocks at the border of the rank, or the others."""
+    def range(self, border: bool) -> tuple[int, int]:
+        """The live blocks at the border of the rank, which come first, or the others."""
         return (0, self.live.border) if border else (self.live.border, self.live.blocks.size)
 
-    def potential(self, found: Contacts, border: bool) -> None:
-        """`block_kernels.potential` of the blocks at the border, which come first, or of the others; their contacts."""
+    def potential(self, found: Contacts, border: bool, under_way: Exchange | None) -> None:
+        """`block_kernels.potential` of the blocks at the border or of the others, and their contacts."""
         blocks, live, d = self.blocks, self.live, self.d
-        touches = block_kernels.potential(
-            self.W, self.touching, self.fields, self.D, self.S2, self.u,
-            live.blocks, live.weights, live.first, live.column, live.owner, live.partial,
-            blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table, d.coefficients,
-            *self._range(border),
-        )
-        if d.case.model.rigid_motion:
-            self._meet(found, self.touching[:touches])
+        for piece in pieces(*self.range(border), PIECE, under_way):
+            touches = block_kernels.potential(
+                self.W, self.touching, self.fields, self.D, self.S2, self.u,
+                live.blocks, live.weights, live.first, live.column, live.owner, live.partial,
+                blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table, d.coefficients, *piece,
+            )
+            if d.case.model.rigid_motion:
+                self.meet(found, self.touching[:touches])
 
-    def meet(self, found: Contacts, border: bool) -> None:
-        """The contacts of the same again."""
-        self._meet(found, np.arange(*self._range(border)))
-
-    def _meet(self, found: Contacts, touching: Integers) -> None:
+    def meet(self, found: Contacts, touching: Integers) -> None:
+        """`block_kernels.meet` of the live blocks in which particles may touch."""
         live = self.live
         block_kernels.meet(
             found, self.fields, live.blocks, live.weights, live.first, live.owner, self.blocks.points,
             touching, self.d.coefficients.c,
         )
 
-    def divergence(self, border: bool, motion: Floats) -> None:
+    def divergence(self, motion: Floats, border: bool, under_way: Exchange | None) -> None:
         """`block_kernels.divergence` of the same."""
         blocks, live, d = self.blocks, self.live, self.d
-        block_kernels.divergence(
-            self.rate, self.fields, self.D, self.S2, self.W, motion,
-            live.blocks, live.weights, live.first, live.column, live.particle, live.owner,
-            blocks.x, blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table,
-            d.coefficients, d.case.model.rigid_motion, d.huang, *self._range(border),
-        )
+        for piece in pieces(*self.range(border), PIECE, under_way):
+            block_kernels.divergence(
+                self.rate, self.fields, self.D, self.S2, self.W, motion,
+                live.blocks, live.weights, live.first, live.column, live.particle, live.owner,
+                blocks.x, blocks.begin, blocks.count, blocks.start, blocks.nodes, d.shape.table,
+                d.coefficients, d.case.model.rigid_motion, d.huang, *piece,
+            )

@@ -6,6 +6,7 @@ partial sums, and every holder adds them in the order of the ranks, so that all 
 count a node on its *owner*, the lowest rank that holds it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -180,10 +181,23 @@ class Exchange:
         self.requests = [comm.Irecv(theirs, rank) for (rank, _), theirs, _ in pairs]
         self.requests += [comm.Isend(mine, rank) for (rank, _), _, mine in pairs]
 
+    def poll(self) -> None:
+        """Let MPI go on with it: values of 8 kB and more move only while both sides call."""
+        MPI.Request.Testall(self.requests)
+
     def wait(self) -> list[Array]:
         """Every neighbour's values at the nodes shared with it."""
         MPI.Request.Waitall(self.requests)
         return self.received
+
+
+def pieces(low: int, high: int, size: int, under_way: Exchange | None) -> Iterator[tuple[int, int]]:
+    """low ... high - 1 in pieces of that size, after each of which what is under way goes on; else in one piece."""
+    step = size if under_way else max(high - low, 1)
+    for begin in range(low, high, step):
+        yield begin, min(begin + step, high)
+        if under_way:
+            under_way.poll()
 
 
 @dataclass(frozen=True)

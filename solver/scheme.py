@@ -14,7 +14,8 @@ from . import block_kernels, contacts, elimination, kernels, rigid, unknowns
 from .active import Active, activate
 from .arrays import Floats, Integers
 from .discretisation import Discretisation
-from .layers import Layer
+from .layers import PIECE, Layer
+from .partition import Exchange, pieces
 from .simd import LANES
 from .state import State
 
@@ -137,25 +138,25 @@ class Scheme:
             layer.W[:] = 0.0
         kernels.start(self.W, a.potential, a.nodes)
         self.contacts.number[0] = 0
-        self._potential(border=True)
+        self._potential(border=True, under_way=None)
         under_way = d.share.halo.start(self.W)  # what goes to shared nodes is complete; the rest is done meanwhile
-        self._potential(border=False)
+        self._potential(border=False, under_way=under_way)
         if self.contacts.number[0] > self.contacts.share.size:
             self._meet_again()
         d.share.halo.finish(self.W, under_way)
 
-    def _potential(self, border: bool) -> None:
+    def _potential(self, border: bool, under_way: Exchange | None) -> None:
         """The part of `_gather` for the points at the border of the rank, or for the others."""
         d, a, table = self.d, self.active, self.d.shape
-        touches = kernels.potential(
-            self.W, self.touching, self.point, self.D, self.S2, self.u_rows, a.loose, a.mask, a.present, a.several,
-            d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
-            *self._range(border),
-        )
-        if d.case.model.rigid_motion:
-            self._meet(self.touching[:touches])
+        for piece in pieces(*self._range(border), LANES * PIECE, under_way):
+            touches = kernels.potential(
+                self.W, self.touching, self.point, self.D, self.S2, self.u_rows, a.loose, a.mask, a.present, a.several,
+                d.weights, table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients, *piece,
+            )
+            if d.case.model.rigid_motion:
+                self._meet(self.touching[:touches])
         for layer in self.layers:
-            layer.potential(self.contacts, border)
+            layer.potential(self.contacts, border, under_way)
             block_kernels.give(self.main.W, layer.W, layer.at)
 
     def _scatter(self, rate: Floats) -> None:
@@ -169,24 +170,25 @@ class Scheme:
             )
         motion = rigid.in_space(self.motion)
         sums, strips = (self.main.rate, self.rate_rows, d.mass), a.unknowns.strips
-        self._divergence(motion, border=True)
+        self._divergence(motion, border=True, under_way=None)
         unknowns.collect(rate, *sums, strips, 0, a.unknowns.shared)
         under_way = a.unknowns.halo.start(rate)
-        self._divergence(motion, border=False)
+        self._divergence(motion, border=False, under_way=under_way)
         unknowns.collect(rate, *sums, strips, a.unknowns.shared, strips.node.size)
         a.unknowns.halo.finish(rate, under_way)
 
-    def _divergence(self, motion: Floats, border: bool) -> None:
+    def _divergence(self, motion: Floats, border: bool, under_way: Exchange | None) -> None:
         """The part of `_scatter` for the points at the border of the rank, or for the others; before the 1/m_a."""
         d, a, table = self.d, self.active, self.d.shape
-        kernels.divergence(
-            self.rate_rows, self.point, self.D, self.S2, self.W, motion, self.velocity,
-            a.loose, a.owner, a.present, d.weights, d.x,
-            table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
-            d.case.model.rigid_motion, d.huang, *self._range(border),
-        )
+        for piece in pieces(*self._range(border), LANES * PIECE, under_way):
+            kernels.divergence(
+                self.rate_rows, self.point, self.D, self.S2, self.W, motion, self.velocity,
+                a.loose, a.owner, a.present, d.weights, d.x,
+                table.offsets, table.nodes, table.rows, table.table, self.work, d.coefficients,
+                d.case.model.rigid_motion, d.huang, *piece,
+            )
         for layer in self.layers:
-            layer.divergence(border, motion)
+            layer.divergence(motion, border, under_way)
             block_kernels.give(self.main.rate, layer.rate, layer.at)
 
     def _range(self, border: bool) -> tuple[int, int]:
@@ -204,7 +206,7 @@ class Scheme:
         for border in (True, False):
             self._meet(np.arange(*self._range(border)))
             for layer in self.layers:
-                layer.meet(self.contacts, border)
+                layer.meet(self.contacts, np.arange(*layer.range(border)))
 
     def _bodies(self, y: Floats) -> tuple[Floats, Floats]:
         """Contact forces and moments of all particles, summed over the ranks, after `_gather`."""

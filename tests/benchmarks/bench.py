@@ -165,7 +165,10 @@ def bench_particles() -> None:
         first = first or result
         print(
             f"  {count:5d} particles  {result['nodes']:.0f} nodes  {result['slots']:.0f} slots"
-            f"  {1e3 * result['seconds']:7.2f} ms/step  ratio {result['seconds'] / first['seconds']:.2f}"
+            f"  {1e3 * result['seconds']:7.2f} ms per evaluation  ratio {result['seconds'] / first['seconds']:.2f}"
+            f"  with stiffness {1e3 * result['stiff']:7.2f} ms"
+            f"  {result['values'] / result['nodes']:.2f} fields per node"
+            f"  {1e9 * result['seconds'] / result['values']:.0f} ns each"
             f"  peak memory {result['memory']:.0f} MB  ratio {result['memory'] / first['memory']:.2f}"
         )
 
@@ -198,9 +201,11 @@ def particles_one(count: int) -> None:
             scheme.rates(y, rate)
 
     seconds = median(lambda: _seconds(five_evaluations) / 5, 7)
+    stiff = median(lambda: _seconds(lambda: scheme.rates(y, rate, tau=0.01)), 7)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     slots = float(state.owner.shape[1])
-    print(json.dumps({"nodes": len(mesh.nodes), "slots": slots, "seconds": seconds, "memory": memory}))
+    found = {"seconds": seconds, "stiff": stiff, "memory": memory}
+    print(json.dumps({"nodes": len(mesh.nodes), "slots": slots, "values": y.size, **found}))
 
 
 BENCHES = {"two-discs": bench_two_discs, "shape": bench_shape, "start": bench_start, "particles": bench_particles}

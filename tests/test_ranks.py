@@ -76,6 +76,35 @@ def test_two_ranks_take_the_adaptive_steps_of_one(tmp_path: Path) -> None:
     assert different(alone, together, 1e-8) == {}
 
 
+POLLING = """
+import sys
+import numpy as np
+from frit.solver import __main__ as solver
+from frit.solver import layers, partition, scheme
+
+layers.PIECE = scheme.PIECE = 1  # a look after each block of 8 points: 400 an evaluation
+world = partition.Ranks.world()
+for values in (1, 1000, 100_000):  # within MPI's own buffers and beyond
+    halo = partition.Halo(world, values, [(1 - world.rank, np.arange(values))])
+    under_way = halo.start(np.full(values, 1.0 + world.rank))
+    for _ in range(1000):
+        under_way.poll()
+        world.barrier()
+    assert not any(under_way.requests), "all is done, and `finish` finds nothing to wait for"
+    array = np.zeros(values)
+    halo.finish(array, under_way)
+    assert (array == 2.0 - world.rank).all()
+sys.exit(solver.main())
+"""
+
+
+def test_values_under_way_move_while_ranks_work(serial: tuple[Case, Path]) -> None:
+    """Looks after them are enough, none has to be waited for; and work in many pieces is the same work."""
+    case, alone = serial
+    together = solve(case, alone.with_name("polling"), ranks=2, script=POLLING)
+    assert different(alone, together, 1e-10) == {}
+
+
 # Live points are chosen every 20 steps; RESTLESS: and then the mesh is divided anew, each time by other work.
 OFTEN = """
 import sys

@@ -228,7 +228,7 @@ def _sense(
     block_kernels.by_column(owners[0], owners[1], state.owner)
     # |sum N u| and |sum grad N u| are at most max |u| times the largest sum of |N| or of |grad N| in a row of the table
     negligible = min(least, switch.eps_eta) / d.steepest
-    for blocks in (d.blocks, d.upright):
+    for blocks in (some for some in (d.blocks, d.upright) if len(some.points)):
         block_kernels.sense(
             flags, owner, clash, _seen(columns, blocks), _seen(owners[0], blocks), _seen(owners[1], blocks),
             switch.eps_rho, switch.eps_eta, least, negligible, blocks.points,

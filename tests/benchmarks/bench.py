@@ -1,4 +1,4 @@
-"""The solver's speed: `make bench`, or `python tests/benchmarks/bench.py [two-discs | shape | start | particles]`.
+"""The solver's speed: `make bench`, or `python tests/benchmarks/bench.py [NAME ...]`, names as in `BENCHES`.
 
 Every figure is the median of several runs in this process or of several processes, on one core. Machines differ and are
 shared: the ratios count.
@@ -13,18 +13,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from frit.solver import vectors
 from frit.solver.case import Case, parse_case
 from frit.solver.geometry import lattice
 from frit.solver.neck import Neck
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
 from frit.solver.run import run
+from frit.solver.scheme import Scheme
 from frit.solver.shape import lme
+from frit.solver.simd import LANES
 from frit.solver.state import State
 
 
@@ -208,7 +212,49 @@ def particles_one(count: int) -> None:
     print(json.dumps({"nodes": len(mesh.nodes), "slots": slots, "values": y.size, **found}))
 
 
-BENCHES = {"two-discs": bench_two_discs, "shape": bench_shape, "start": bench_start, "particles": bench_particles}
+def bench_traffic() -> None:
+    """Bytes that one evaluation moves per live point, and at what part of the rate of `new = old + dt rate`."""
+    old, rate, new = np.ones((3, 20_000_000))
+    stream = 3 * old.nbytes / median(lambda: _seconds(lambda: vectors.advance(new, old, 0.5, rate)), 7)
+    print(f"memory traffic of one evaluation; new = old + dt rate moves {stream / 1e9:.1f} GB/s on one core")
+    for dim, size, count in ((2, [170.0, 170.0], 16), (3, [42.0, 42.0, 42.0], 4)):
+        places = np.stack(np.meshgrid(*[np.arange(count)] * dim), axis=-1).reshape(-1, dim)
+        case = parse_case({
+            "domain": {"size": size},
+            "nodes": {"source": "lattice", "spacing": 1.0},
+            "particles": {"source": "list", "centres": (7.0 + 9.6 * places).tolist(), "radii": [5.0] * count**dim},
+            "time": {"end": 1.0},
+        })  # fmt: skip
+        scheme, state = prepare(case, build_mesh(case, Ranks()), Ranks())
+        y = scheme.active.unknowns.take(state.u)
+        evaluate = partial(scheme.rates, y, np.empty_like(y))
+        seconds = median(partial(_seconds, evaluate), 9)
+        bytes_moved = traffic(scheme)
+        points = scheme.active.live.size
+        fields = scheme.active.blocks.column.size / scheme.active.blocks.blocks.size
+        print(
+            f"  {dim}-D  {points} live points, {fields:.1f} fields  {bytes_moved / points:5.0f} bytes per point"
+            f"  {1e3 * seconds:6.1f} ms  {bytes_moved / seconds / 1e9:.1f} GB/s"
+            f"  {bytes_moved / seconds / stream:.0%} of that rate"
+        )
+
+
+def traffic(scheme: Scheme) -> int:
+    """Bytes of the arrays that an evaluation reads and writes, each counted once a pass; the table stays in the cache."""
+    y = 8 * scheme.active.unknowns.size
+    moved = 3 * y + 4 * y  # y to the columns, and these read; rates added to columns, and collected
+    moved += 5 * scheme.W.nbytes  # cleared, added to, divided
+    for layer in scheme.layers:
+        live, blocks = layer.live, layer.blocks
+        lists = blocks.nodes.itemsize * int(blocks.count[live.blocks].sum()) + 3 * 8 * live.blocks.size
+        both = layer.fields.nbytes + layer.D.nbytes + layer.S2.nbytes  # written, then read
+        both += live.weights.nbytes + live.blocks.nbytes + live.first.nbytes + live.column.nbytes + lists
+        moved += 2 * both + live.partial.nbytes + live.owner[live.partial].nbytes
+        moved += live.particle.nbytes + 8 * 3 * LANES * live.blocks.size  # where the points are
+    return moved + 2 * (scheme.point.nbytes + scheme.active.mask.nbytes)
+
+
+BENCHES = {"traffic": bench_traffic, "two-discs": bench_two_discs, "shape": bench_shape, "start": bench_start, "particles": bench_particles}
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["particles-one"]:

@@ -240,7 +240,7 @@ def bench_traffic() -> None:
 
 
 def traffic(scheme: Scheme) -> int:
-    """Bytes of the arrays that an evaluation reads and writes, each counted once a pass; the table stays in the cache."""
+    """Bytes of the arrays that an evaluation reads and writes, each counted once a pass; the table stays at hand."""
     y = 8 * scheme.active.unknowns.size
     moved = 3 * y + 4 * y  # y to the columns, and these read; rates added to columns, and collected
     moved += 5 * scheme.W.nbytes  # cleared, added to, divided
@@ -254,7 +254,13 @@ def traffic(scheme: Scheme) -> int:
     return moved + 2 * (scheme.point.nbytes + scheme.active.mask.nbytes)
 
 
-BENCHES = {"traffic": bench_traffic, "two-discs": bench_two_discs, "shape": bench_shape, "start": bench_start, "particles": bench_particles}
+BENCHES = {
+    "traffic": bench_traffic,
+    "two-discs": bench_two_discs,
+    "shape": bench_shape,
+    "start": bench_start,
+    "particles": bench_particles,
+}
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["particles-one"]:

@@ -65,7 +65,7 @@ class Active:
 Room = Callable[[int, int], Floats]  # work space of so many rows and columns, valid until the next is asked for
 
 
-def activate(d: Discretisation, state: State, room: Room = lambda rows, columns: np.empty((rows, columns))) -> Active:
+def activate(d: Discretisation, state: State, room: Room) -> Active:
     """Make the set for the state. A particle's order parameter is set to zero at nodes that no point sees where it
     exists (`LEAST`), and slots are moved where particles that shared one have come close. Collective; the result does
     not depend on the number of ranks.
@@ -192,7 +192,7 @@ def _claim(d: Discretisation, owner: Numbers, clash: Integers, owners: Floats) -
     high, low = owners
     high[:], low[:] = -1.0, block_kernels.NOBODY
     for blocks in (d.blocks, d.upright):
-        largest, smallest = _seen(high, blocks), _seen(low, blocks)
+        largest, smallest = _numbered(high, blocks), _numbered(low, blocks)
         block_kernels.claim(
             largest, smallest, owner, blocks.points, blocks.begin, blocks.nodes, near.kind, near.starts, near.places
         )
@@ -230,14 +230,14 @@ def _sense(
     negligible = min(least, switch.eps_eta) / d.steepest
     for blocks in (some for some in (d.blocks, d.upright) if len(some.points)):
         block_kernels.sense(
-            flags, owner, clash, _seen(columns, blocks), _seen(owners[0], blocks), _seen(owners[1], blocks),
+            flags, owner, clash, _numbered(columns, blocks), _numbered(owners[0], blocks), _numbered(owners[1], blocks),
             switch.eps_rho, switch.eps_eta, least, negligible, blocks.points,
-            changed[blocks.at] if blocks.at.size else changed,
-            blocks.begin, blocks.count, blocks.start, blocks.nodes, table.table, near.kind, near.starts, near.places,
+            changed[blocks.seen], blocks.begin, blocks.count, blocks.start, blocks.nodes, table.table,
+            near.kind, near.starts, near.places,
         )
 
 
-def _seen(columns: Floats, blocks: Blocks) -> Floats:
+def _numbered(columns: Floats, blocks: Blocks) -> Floats:
     """Fields by columns as the blocks number the nodes: for upright ones a copy."""
     if not blocks.at.size:
         return columns
@@ -268,13 +268,12 @@ def _watch(
     table, near, switch = d.shape, d.nearest, d.case.activation
     kernels.all_slots(owned, node_owner)
     for blocks, live in zip((d.blocks, d.upright), lives, strict=True):
-        bits, here = (watch, owned) if not blocks.at.size else (watch[blocks.at], owned[blocks.at])
+        bits = watch[blocks.seen]
         block_kernels.watch_nodes(
-            bits, here, live.blocks, live.weights, live.first, live.column, live.owner, blocks.points,
+            bits, owned[blocks.seen], live.blocks, live.weights, live.first, live.column, live.owner, blocks.points,
             blocks.begin, blocks.start, blocks.nodes, table.table, near.kind, near.starts, near.places,
         )
-        if blocks.at.size:
-            watch[blocks.at] = bits
+        watch[blocks.seen] = bits
     kernels.watch_nodes(
         watch, flags, owner, owned, table.offsets, table.nodes, table.rows, table.table,
         near.kind, near.starts, near.places, np.concatenate([loose, np.flatnonzero(flags == 0)]),

@@ -38,6 +38,12 @@ class Blocks:
     loose_border: int  # how many of them do
 
 
+    @property
+    def seen(self) -> Integers | slice:
+        """The nodes that the points see, as an index of arrays of nodes."""
+        return self.at if self.at.size else slice(None)
+
+
 @dataclass(frozen=True)
 class LiveBlocks:
     """The blocks with live points, and the fields that exist there.

@@ -13,7 +13,7 @@ rows their derivatives.
 import numpy as np
 
 from .arrays import Bytes, Flags, Floats, Integers, Numbers
-from .contacts import Contacts, add_contact
+from .contacts import FAR, Contacts, add_contact
 from .energy import Coefficients, Field, df_deta, df_drho, free_energy_density, mobility
 from .jit import inlined, jit
 from .simd import (
@@ -189,7 +189,8 @@ def meet(
         for s in range(owner.shape[1]):
             for t in range(s + 1, owner.shape[1]):
                 a, b = owner[l, s], owner[l, t]
-                if min(a, b) >= 0 and point[row, 1 + s] > 0.0 and point[row, 1 + t] > 0.0:
+                product = point[row, 1 + s] * point[row, 1 + t]
+                if min(a, b) >= 0 and product > FAR * c and point[row, 1 + s] > 0.0:
                     add_contact(found, point, row, 0, row, 1 + s, row, 1 + t, a, b, loose[l], weights[loose[l]], c)
 
 

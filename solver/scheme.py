@@ -120,9 +120,7 @@ class Scheme:
         size = self.motion.shape[1]
         stiffness = np.zeros((len(a.pairs), 2, size, size))
         keys = a.pairs[:, 0] * self.particles + a.pairs[:, 1]
-        contacts.contact_stiffness(
-            stiffness, keys, self.contacts, d.x, self.particles, d.coefficients, d.huang
-        )
+        contacts.contact_stiffness(stiffness, keys, self.contacts, d.x, self.particles, d.coefficients, d.huang)
         d.share.ranks.sum(stiffness)
         pushing = stiffness.any(axis=(1, 2, 3))
         if not np.array_equal(a.pairs[pushing], self.order.pairs):

@@ -14,18 +14,18 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel
 
 from . import admission, delivery, filters, metrics, openapi, stream, views
+from .bodies import AT_ONCE, SMALL, LimitedRoute, declared
 from .comparison import ObservableError, compare
 from .engine import Engine
 from .jobs import SENTENCES, Job
 from .problems import WrongField, handle_problems, refused, unavailable
-from .security import Gate, Reader, Submitter, needs
+from .security import Gate, Reader, Submitter, needs, still_admitted
 from .settings import Settings
 from .store import Key, SweepRecord
 
-IN_THREAD = 50_000  # bytes of a body above which its case is checked in a thread
 PROBLEMS = openapi.problems
 
-api = APIRouter(prefix="/v1")
+api = APIRouter(prefix="/v1", route_class=LimitedRoute)
 plain = APIRouter()
 
 
@@ -35,7 +35,8 @@ def create_app(settings: Settings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with Engine(settings) as engine:
-            app.state.engine = engine
+            app.state.engine, app.state.settings = engine, settings
+            app.state.large_bodies = asyncio.Semaphore(AT_ONCE)
             app.state.queue = admission.QueueLimit(engine.store, settings.queue_limit)
             yield
             if settings.release:
@@ -100,6 +101,13 @@ def key_of(value: str | None, who: str, route: str, request: Any) -> Key | None:
     return Key(f"{who} {route}", value, hashlib.sha256(text.encode()).hexdigest())
 
 
+async def key_of_body(value: str | None, who: str, route: str, body: BaseModel) -> Key | None:
+    """As `key_of`, for a request whose body may be large."""
+    if value is None:
+        return None
+    return await asyncio.to_thread(lambda: key_of(value, who, route, body.model_dump(mode="json")))
+
+
 def hidden(engine: Engine) -> str:
     """What no answer shows."""
     return str(engine.settings.data.absolute())
@@ -129,12 +137,11 @@ async def submit_job(
     """Queue a case. Every request makes a job, also of a case that was run before; see Idempotency-Key."""
     engine = running(request)
     store = engine.store
-    key = key_of(given, who, "POST /v1/jobs", submission.model_dump(mode="json") if given else None)
+    key = await key_of_body(given, who, "POST /v1/jobs", submission)
     if key is not None and (before := store.known(key)) is not None:
         job = store.job(before)
     else:
-        large = int(request.headers.get("content-length", IN_THREAD)) >= IN_THREAD
-        if large or submission.files:
+        if declared(request) >= SMALL or submission.files:
             new = await asyncio.to_thread(admission.job_of, submission, engine.settings)
         else:
             new = admission.job_of(submission, engine.settings)
@@ -211,13 +218,13 @@ async def show_log(request: Request, engine: TheEngine, who: Reader, job: TheJob
 
 @api.get("/jobs/{id}/events", tags=["jobs"], response_class=EventSourceResponse, responses=PROBLEMS(401, 403, 404, 503))
 async def follow_job(
-    engine: TheEngine, who: Reader, job: TheJob, last_event_id: Annotated[str | None, Header()] = None
+    request: Request, engine: TheEngine, who: Reader, job: TheJob, last_event_id: Annotated[str | None, Header()] = None
 ) -> AsyncIterator[ServerSentEvent]:
     """The job's life as server-sent events `state`, `history`, `progress` and, once it is final, `end`.
 
     Last-Event-ID goes on after the event of that id.
     """
-    async for event in stream.events(engine, job.id, last_event_id):
+    async for event in stream.events(engine, job.id, last_event_id, lambda: still_admitted(request)):
         yield event
 
 
@@ -265,7 +272,7 @@ async def submit_sweep(
 ) -> Response:
     """Queue the points of a sweep that no job has yet; the others are shared with the jobs there are."""
     store = engine.store
-    key = key_of(given, who, "POST /v1/sweeps", submission.model_dump(mode="json") if given else None)
+    key = await key_of_body(given, who, "POST /v1/sweeps", submission)
     if key is not None and (before := store.known(key)) is not None:
         sweep = store.sweep(before)
     else:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from frit.solver.characters import visible
+
 from .words import AsJson, DataFolder, SweepFile, fail, refuse, show_table
 
 if TYPE_CHECKING:
@@ -55,12 +57,14 @@ def serve(
     given = {"data": data, "host": host, "port": port, **{k: v for k, v in chosen.items() if v is not None}}
     try:
         settings = Settings.model_validate(Settings().model_dump() | given)
-        check(settings)
+        warning = check(settings)
     except ValidationError as error:
         refuse(*(f"FRIT_{'_'.join(map(str, e['loc'])).upper()} = {e['input']!r}: {e['msg']}" for e in error.errors()))
     except (EngineError, AddressError) as error:
         refuse(str(error))
     typer.echo(f"frit serves {settings.data.absolute()} with {settings.cores} cores", err=True)
+    if warning is not None:
+        typer.echo(warning, err=True)
     uvicorn.run(
         create_app(settings), host=host, port=port, access_log=access_log, server_header=False,
         timeout_graceful_shutdown=LINGER,
@@ -132,7 +136,7 @@ def show(identifier: JobId, url: Url = HERE, token: Secret = None, as_json: AsJs
     for key, value in data.items():
         if value not in (None, [], {}) and key != "links":
             text = value if isinstance(value, str) else json.dumps(value)
-            typer.echo(f"{key.replace('_', ' '):18}{text}")
+            typer.echo(f"{key.replace('_', ' '):18}{visible(text)}")
 
 
 def log(
@@ -148,7 +152,7 @@ def log(
             final = job.final  # as it was before the last look
             added = job.log_bytes(offset)
             offset += len(added)
-            typer.echo(added.decode(errors="replace"), nl=False)
+            typer.echo(visible(added.decode(errors="replace"), keep="\n\t"), nl=False)
             if final or not follow:
                 return
             time.sleep(0.5)

@@ -93,13 +93,13 @@ class Engine:
         return self.settings.runs / identifier
 
 
-def check(settings: Settings) -> None:
-    """Say early why a service cannot be started. Raises `EngineError`, `AddressError`."""
+def check(settings: Settings) -> str | None:
+    """Say early why a service cannot be started, or answers nobody. Raises `EngineError`, `AddressError`."""
     lock = take(settings.data)
     try:
         store = Store(settings.data)
         try:
-            check_address(settings, store)
+            return check_address(settings, store)
         finally:
             store.close()
     except (IndexVersionError, StoreError) as error:

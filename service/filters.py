@@ -30,6 +30,7 @@ from .schema import job_tags, jobs, sweep_jobs
 Condition = sa.ColumnElement[bool]
 PAGE = 50  # jobs on a page, unless asked for
 LARGEST_PAGE = 500
+MOST = 200  # values of all filters of a query together: SQLite takes no deeper conditions than a thousand
 NEAR = 1000  # jobs that are looked at before a range is sorted
 ORDERING = ("lt", "le", "gt", "ge")
 OPERATORS = ("eq", "ne", *ORDERING, "in")
@@ -169,6 +170,9 @@ def select(
     given: dict[str, list[str]] = {}
     for name, value in parameters:
         given.setdefault(name, []).append(value)
+    if (values := sum(1 + value.count(",") for found in given.values() for value in found)) > MOST:
+        allowed = f"has {values} values in all filters together, must be at most {MOST}"
+        raise refused("refused-query", "The query is refused", [WrongField(parameter="filters", detail=allowed)])
     by = given.get("order", ["-created"])[-1]
     asked = [name for name in given if name not in ("order", "limit", "cursor")]
     found = {name: scalar for name in asked if (scalar := _scalar_of(name)) is not None and index(scalar)}

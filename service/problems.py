@@ -23,6 +23,9 @@ from .store import KeyReusedError, NotFoundError, StoreError
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER = 5  # seconds
 SHOWN = 200  # characters of a refused value
+TOLD = 500  # characters of a pointer, a detail or a parameter's name
+MOST_ERRORS = 50  # wrong fields that are told; the others are counted
+MOST_BYTES = 64_000  # of a problem
 PART = re.compile(r'"([^"]*)"|\[(\d+)\]|([^.\[\]"]+)')
 
 
@@ -59,6 +62,8 @@ class ProblemDetails(BaseModel):
     status: int
     detail: str
     errors: list[WrongField] = []
+    more: int = 0
+    """wrong fields beyond those in `errors`; at least as many"""
     state: str | None = None
 
 
@@ -66,27 +71,47 @@ class HttpError(Exception):
     """An error on its way to the client."""
 
     def __init__(
-        self, status: int, kind: str, title: str, detail: str,
-        errors: Iterable[WrongField] = (), headers: Mapping[str, str] | None = None, state: str | None = None,
+        self, status: int, kind: str, title: str, detail: str, errors: Iterable[WrongField] = (),
+        headers: Mapping[str, str] | None = None, state: str | None = None, more: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(detail)
+        told = [short(field) for field in errors]
         self.details = ProblemDetails(
-            type=f"/problems/{kind}", title=title, status=status, detail=detail, errors=list(errors), state=state
-        )
+            type=f"/problems/{kind}", title=title, status=status, detail=cut(detail), state=state,
+            errors=told[:MOST_ERRORS], more=more + len(told[MOST_ERRORS:]),
+        )  # fmt: skip
         self.headers = dict(headers or {})
 
     def response(self) -> Response:
-        """As it is sent: ASCII, so that no text of a request can break it."""
-        tree = self.details.model_dump(exclude_none=True)
-        if not tree["errors"]:
-            del tree["errors"]
-        return Response(json.dumps(tree), self.details.status, self.headers, MEDIA_TYPE)
+        """As it is sent: ASCII, so that no text of a request can break it, and of limited length."""
+        details = self.details
+        while len(body := json.dumps(self._tree(details))) > MOST_BYTES:
+            half = len(details.errors) // 2
+            more = details.more + len(details.errors) - half
+            details = details.model_copy(update={"errors": details.errors[:half], "more": more})
+        return Response(body, details.status, self.headers, MEDIA_TYPE)
+
+    @staticmethod
+    def _tree(details: ProblemDetails) -> dict[str, Any]:
+        return {key: value for key, value in details.model_dump(exclude_none=True).items() if value not in ([], 0)}
 
 
-def refused(kind: str, title: str, fields: Sequence[WrongField], status: int = 422) -> HttpError:
+def cut(text: str, most: int = TOLD) -> str:
+    """The text, or its beginning and three dots."""
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def short(field: WrongField) -> WrongField:
+    """A wrong field whose words are of limited length, whatever the request had for names."""
+    words = {"pointer": field.pointer, "parameter": field.parameter, "detail": field.detail}
+    return field.model_copy(update={key: cut(text) for key, text in words.items() if text is not None})
+
+
+def refused(kind: str, title: str, fields: Sequence[WrongField], status: int = 422, more: int = 0) -> HttpError:
     """A request with wrong fields."""
+    fields = [short(field) for field in fields[:MOST_ERRORS]]
     places = (f"{field.parameter or field.pointer or 'body'}: {field.detail}" for field in fields)
-    return HttpError(status, kind, title, "; ".join(places), fields)
+    return HttpError(status, kind, title, "; ".join(places), fields, more=more)
 
 
 def refused_case(error: CaseError, pointer: str, title: str = "The case is refused") -> HttpError:
@@ -125,15 +150,29 @@ def escaped(part: str) -> str:
 
 def shown(value: Any) -> Any:
     """A refused value as it may be sent: short, and without numbers that JSON does not know."""
-    if value is None or isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value)):
+    if value is None or isinstance(value, bool) or (isinstance(value, float) and math.isfinite(value)):
         return value
+    if isinstance(value, int):
+        return value if value.bit_length() < 64 else cut(f"{value:#x}", SHOWN)
+    if isinstance(value, str):
+        return cut(value, SHOWN)
+    if isinstance(value, list | tuple | dict):
+        text, whole = beginning(value, SHOWN)
+        return value if whole else cut(text, SHOWN)
+    return cut(repr(value), SHOWN)
+
+
+def beginning(value: Any, most: int) -> tuple[str, bool]:
+    """The first characters of a value's JSON, however large it is, and whether they are all of it as JSON has it."""
+    text = ""
     try:
-        text = value if isinstance(value, str) else json.dumps(value, allow_nan=False)
+        for piece in json.JSONEncoder(allow_nan=False).iterencode(value):
+            text += piece[: most + 1]
+            if len(text) > most:
+                return text, False
     except (TypeError, ValueError, RecursionError):
-        text = repr(value)
-    if len(text) > SHOWN:
-        return text[: SHOWN - 3] + "..."
-    return value if isinstance(value, list | tuple | dict) and text[:1] in "[{" else text
+        return cut(text or type(value).__name__, most), False
+    return text, True
 
 
 def handle_problems(app: FastAPI, routes: Sequence[BaseRoute]) -> None:
@@ -157,7 +196,9 @@ def as_problem(error: Exception) -> HttpError:
     if isinstance(error, HttpError):
         return error
     if isinstance(error, RequestValidationError):
-        return refused("refused-request", "The request is refused", [_wrong(entry) for entry in error.errors()])
+        entries = error.errors()
+        fields = [_wrong(entry) for entry in entries[:MOST_ERRORS]]
+        return refused("refused-request", "The request is refused", fields, more=len(entries[MOST_ERRORS:]))
     if isinstance(error, StoreError):
         return unavailable("the index cannot be used now")
     if isinstance(error, NotFoundError):
@@ -180,8 +221,6 @@ def as_problem(error: Exception) -> HttpError:
 def _wrong(entry: Mapping[str, Any]) -> WrongField:
     """Of pydantic's errors: the first part of the place says where the value came from."""
     where, *parts = entry["loc"]
-    if entry["type"] == "json_invalid":
-        return WrongField(pointer="", detail=f"not valid JSON at character {parts[0]}: {entry['ctx']['error']}")
     value = None if entry["type"] == "missing" else shown(entry["input"])
     if where == "body":
         pointer = "".join(f"/{escaped(str(part))}" for part in parts)

@@ -47,6 +47,8 @@ class Settings(BaseSettings):
     """bytes free in the data folder below which no job is started"""
     body_limit: AtLeastOne = 20_000_000
     """bytes of a request's body, at most"""
+    values_limit: AtLeastOne = 500_000
+    """values of a request's JSON, at most; the content of a file is one"""
     points_limit: AtLeastOne = 100_000
     """points of a sweep, at most"""
     nodes_limit: AtLeastOne = 20_000_000

@@ -713,6 +713,10 @@ class Store:
         rows = self._ask("SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL")
         return {hashed: Token(name, scope, created, None) for hashed, name, scope, created in rows}
 
+    def had_tokens(self) -> bool:
+        """Whether a token was ever made, also one that is revoked by now."""
+        return bool(self._ask("SELECT 1 FROM tokens LIMIT 1"))
+
     def _ask(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
         """What is asked all the time: no layer between it and SQLite."""
         try:

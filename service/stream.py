@@ -6,7 +6,7 @@ that the client has then. A client that comes back with it gets what followed, w
 
 import re
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import anyio
@@ -28,11 +28,13 @@ def place(last_event_id: str | None) -> tuple[int, int]:
     return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
-async def events(engine: Engine, identifier: str, last_event_id: str | None) -> AsyncIterator[ServerSentEvent]:
-    """`state`, `history`, `progress`, and `end` once the job is final."""
+async def events(
+    engine: Engine, identifier: str, last_event_id: str | None, admitted: Callable[[], bool]
+) -> AsyncIterator[ServerSentEvent]:
+    """`state`, `history`, `progress`, and `end` once the job is final; no more once the client is not admitted."""
     store, (event, rows), told = engine.store, place(last_event_id), None
     hidden = str(engine.settings.data.absolute())
-    while True:
+    while admitted():
         looked = time.monotonic()
         try:
             job = store.job(identifier)

@@ -5,6 +5,7 @@ looks tokens up at each request, and only its own writer moves the write-ahead l
 """
 
 import hashlib
+import os
 import re
 import secrets
 import sqlite3
@@ -14,11 +15,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from . import migrations
+from .files import flush_folder
 from .store import BUSY, NotFoundError, StoreError, Token
 
 SCOPES = ("read", "submit", "admin")  # each allows all that the ones before allow
 PREFIX = "frit_"
 NAME = re.compile(r"[\w.@-]{1,100}")
+MARK = "tokens-needed"  # a file of the data folder: there is, or was, a token; no index, lost or new, opens it again
 
 
 def digest(secret: str) -> str:
@@ -31,6 +34,22 @@ def allows(scope: str, needed: str) -> bool:
     return SCOPES.index(scope) >= SCOPES.index(needed)
 
 
+def is_marked(folder: Path) -> bool:
+    """Whether the data folder has, or had, a token: from then on nobody is served without one."""
+    return os.path.lexists(folder / MARK)
+
+
+def set_mark(folder: Path) -> None:
+    """Make the mark durable, before the first token is."""
+    if not is_marked(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(folder / MARK, "w", encoding="utf-8") as file:
+            file.write("This folder has or had access tokens: frit serves it only to who brings one.\n")
+            file.flush()
+            os.fsync(file.fileno())
+        flush_folder(folder)
+
+
 def create(folder: Path, name: str, scope: str) -> str:
     """The secret of a new token. Raises `ValueError` for a wrong or taken name, `StoreError`."""
     if scope not in SCOPES:
@@ -38,6 +57,10 @@ def create(folder: Path, name: str, scope: str) -> str:
     if not NAME.fullmatch(name):
         raise ValueError(f"name = {name!r}: must be 1 to 100 letters, digits or any of . _ @ -")
     secret = PREFIX + secrets.token_urlsafe(32)
+    try:
+        set_mark(folder)
+    except OSError as error:
+        raise StoreError(f"{folder}: {error}") from error
     with _transaction(folder) as connection:
         if connection.execute("SELECT 1 FROM tokens WHERE name = ?", (name,)).fetchone():
             raise ValueError(f"name = {name!r}: is taken, also by a revoked token")

@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from frit.solver.characters import HIDDEN
+
 from .jobs import Job, State
 from .store import Attempt, SweepRecord
 
@@ -30,8 +32,9 @@ EXAMPLE_SWEEP: dict[str, Any] = {
     "axes": {"particles.mean_radius": [8.0, 10.0]},
 }  # fmt: skip
 
-Text = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
-Tag = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Text = Annotated[str, Field(max_length=500, pattern=f"^[^{HIDDEN}]*$")]
+Tag = Annotated[str, Field(min_length=1, max_length=100, pattern=f"^[^{HIDDEN}]+$")]
+Tags = Annotated[list[Tag], Field(max_length=50, fail_fast=True)]
 WHOLE = BeforeValidator(lambda value: int(value) if isinstance(value, float) and value.is_integer() else value)
 Priority = Annotated[int, Field(strict=True, ge=-1_000_000, le=1_000_000), WHOLE]
 Ranks = Annotated[int, Field(strict=True, ge=1, le=1_000_000), WHOLE]
@@ -67,7 +70,7 @@ class JobSubmission(Body):
     ranks: Ranks = 1
     name: Text | None = None
     priority: Priority = 0
-    tags: Annotated[list[Tag], Field(max_length=50)] = []
+    tags: Tags = []
     time_limit: Limit | None = None
     files: Files = {}
 
@@ -81,7 +84,7 @@ class SweepSubmission(Body):
     ranks: Ranks | None = None
     name: Text | None = None
     priority: Priority | None = None
-    tags: Annotated[list[Tag], Field(max_length=50)] | None = None
+    tags: Tags | None = None
     time_limit: Limit | None = None
     files: Files = {}
 

@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from frit.solver.characters import visible
+
 SweepFile = Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="TOML or JSON.")]
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -21,14 +23,14 @@ DataFolder = Annotated[
 def refuse(*lines: str) -> NoReturn:
     """Say on stderr what is wrong with the input, and leave with 2."""
     for line in lines:
-        typer.echo(line, err=True)
+        typer.echo(visible(line, keep="\n"), err=True)
     raise typer.Exit(2)
 
 
 def fail(*lines: str) -> NoReturn:
     """Say on stderr what went wrong, and leave with 1."""
     for line in lines:
-        typer.echo(line, err=True)
+        typer.echo(visible(line, keep="\n"), err=True)
     raise typer.Exit(1)
 
 
@@ -44,8 +46,8 @@ def show_table(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def cell(value: object) -> str:
-    """Of a table."""
-    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+    """Of a table; nothing in it moves the terminal."""
+    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else visible(str(value))
 
 
 def in_words(progress: dict[str, Any]) -> str:

@@ -35,14 +35,17 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 from scipy.spatial import cKDTree
 
 from . import particle_file
 from .arrays import Flags, Floats
+from .characters import UNSHOWABLE
 from .particle_file import ParticleFileError
 
 CANONICAL = json.JSONEncoder(sort_keys=True)
 PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
+LONGEST_KEY = 100  # characters of an unknown key that are compared with known ones
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
 # --- vocabulary
@@ -54,7 +57,16 @@ NonNegative = Annotated[float, FINITE, Field(ge=0), ONE_ZERO]
 Positive = Annotated[float, FINITE, Field(gt=0)]
 Fraction = Annotated[float, FINITE, Field(gt=0, lt=1)]
 Flag = Annotated[bool, Field(strict=True)]
-Text = Annotated[str, Field(strict=True)]
+
+
+def showable(text: str) -> str:
+    """The text, unless it has characters that must not be shown."""
+    if UNSHOWABLE.search(text):
+        raise PydanticCustomError("unshowable", "must have no control characters")
+    return text
+
+
+Text = Annotated[str, Field(strict=True), AfterValidator(showable)]
 Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
 Box = tuple[Point, Point]
@@ -764,7 +776,7 @@ def _table(loc: Place) -> type[BaseModel]:
 
 def _known(name: str, table: type[BaseModel]) -> str:
     known = list(table.model_fields)
-    close = difflib.get_close_matches(name, known, n=1)
+    close = difflib.get_close_matches(name[:LONGEST_KEY], known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"unknown key; allowed here: {', '.join(known)}{hint}"
 

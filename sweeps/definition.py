@@ -10,13 +10,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
-from frit.solver.case import CaseError, Place, Problem, case_schema, problems, read_tree, unknown_part
+from frit.solver.case import CaseError, Place, Problem, Text, case_schema, problems, read_tree, unknown_part
 
 FREE = ("name", "output.checkpoint_every")  # keys that change no result: axes along them would repeat one case
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Whole = Annotated[int, Field(strict=True)]
-Text = Annotated[str, Field(strict=True)]
 
 
 class Part(BaseModel):

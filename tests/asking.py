@@ -63,7 +63,8 @@ def settings_in(folder: Path, **more: Any) -> Settings:
 def service(folder: Path, **more: Any) -> Iterator[TestClient]:
     """The app in this process, asked without a socket."""
     app = create_app(settings_in(folder, **more))
-    with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as client:
+    here = ("127.0.0.1", 50000)
+    with TestClient(app, base_url="http://localhost", raise_server_exceptions=False, client=here) as client:
         yield client
 
 

@@ -22,7 +22,6 @@ Secret = Annotated[str | None, typer.Option("--token", envvar="FRIT_TOKEN", help
 JobId = Annotated[str, typer.Argument(metavar="ID", help="Of the job, or the beginning of it.")]
 HERE = "http://127.0.0.1:8000"
 CURVES = (".png", ".pdf", ".svg")
-LINGER = 3  # seconds for open answers when the service ends; a stream of events has no end of its own
 
 
 def add_to(app: typer.Typer) -> None:
@@ -52,6 +51,7 @@ def serve(
     from .engine import EngineError, check
     from .security import AddressError
     from .settings import Settings
+    from .wire import options
 
     chosen = {"cores": cores, "release": release}
     given = {"data": data, "host": host, "port": port, **{k: v for k, v in chosen.items() if v is not None}}
@@ -65,10 +65,7 @@ def serve(
     typer.echo(f"frit serves {settings.data.absolute()} with {settings.cores} cores", err=True)
     if warning is not None:
         typer.echo(warning, err=True)
-    uvicorn.run(
-        create_app(settings), host=host, port=port, access_log=access_log, server_header=False,
-        timeout_graceful_shutdown=LINGER,
-    )  # fmt: skip
+    uvicorn.run(create_app(settings), host=host, port=port, access_log=access_log, **options(settings))
 
 
 def submit(

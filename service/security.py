@@ -97,7 +97,10 @@ class Gate:
                 self._check(scope)
             except (HttpError, HTTPException, StoreError, OSError) as error:
                 trouble = StoreError(str(error)) if isinstance(error, OSError) else error
-                await as_problem(trouble).response()(scope, receive, send)
+                answer = as_problem(trouble).response()
+                if "transfer-encoding" in Headers(scope=scope):  # nobody knows when that would end
+                    answer.headers["Connection"] = "close"
+                await answer(scope, receive, send)
                 return
             receive = self._counted(receive)
         await self.app(scope, receive, send)

@@ -45,6 +45,8 @@ class Settings(BaseSettings):
     """seconds between two looks at what running jobs have written"""
     free_disk: Annotated[int, Field(ge=0)] = 200_000_000
     """bytes free in the data folder below which no job is started"""
+    connections_limit: AtLeastOne = 500
+    """connections at once, at most, those that follow events among them"""
     body_limit: AtLeastOne = 20_000_000
     """bytes of a request's body, at most"""
     values_limit: AtLeastOne = 500_000

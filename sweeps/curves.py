@@ -73,7 +73,9 @@ def figure(observable: str, curves: Sequence[Curve]) -> "Figure":
     ax.grid(alpha=0.25, lw=0.5)
     ax.margins(x=0.01)
     if len(curves) > 1:
-        made.legend(loc="outside right upper", fontsize=7.5, frameon=False)
+        legend = made.legend(loc="outside right upper", fontsize=7.5, frameon=False)
+        for text in legend.get_texts():
+            text.set_parse_math(False)  # a dollar in a name begins no formula
     return made
 
 

@@ -18,6 +18,7 @@ from fastapi.testclient import TestClient
 
 from frit.service.app import create_app
 from frit.service.settings import Settings
+from frit.service.wire import options
 
 Tree = dict[str, Any]
 
@@ -71,8 +72,9 @@ def service(folder: Path, **more: Any) -> Iterator[TestClient]:
 @contextmanager
 def listening(folder: Path, **more: Any) -> Iterator[str]:
     """The app in a thread behind a real socket; gives its URL."""
+    settings = settings_in(folder, **more)
     config = uvicorn.Config(
-        create_app(settings_in(folder, **more)), port=0, log_level="error", timeout_graceful_shutdown=1
+        create_app(settings), port=0, log_level="error", **options(settings) | {"timeout_graceful_shutdown": 1}
     )
     server = uvicorn.Server(config)
     listener = socket.create_server(("127.0.0.1", 0))

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 from scipy.spatial import cKDTree
 
 from frit.solver.arrays import Floats
-from frit.sweeps import plots
+from frit.sweeps import curves, plots
 from frit.sweeps.plots import PlotError
 
 SIZE = [60.0, 36.0]
@@ -179,3 +179,12 @@ def test_missing_or_empty_snapshots_are_named(tmp_path: Path) -> None:
     zarr.create_group(tmp_path / "snapshots.zarr").create_array("time", data=np.empty(0))
     with pytest.raises(PlotError, match="no snapshots"):
         plots.nearest_time(tmp_path, 0.0)
+
+
+def test_a_name_is_never_a_formula_nor_a_page(tmp_path: Path) -> None:
+    """Names come from whoever submits."""
+    names = [r"$\frac{", "</script><script>alert(1)</script>", "_hidden", "$x$"]
+    made = [curves.Curve(name, {}, [0.0, 1.0], [0.3, 0.2]) for name in names]
+    curves.write(tmp_path / "a.png", "vacancy_ratio", made)
+    curves.write(tmp_path / "a.html", "vacancy_ratio", made)
+    assert "alert(1)</script>" not in (tmp_path / "a.html").read_text()

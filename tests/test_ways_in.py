@@ -179,4 +179,3 @@ def test_a_stream_ends_with_its_token(tmp_path: Path) -> None:
 def test_an_origin_that_is_none_is_refused(tmp_path: Path, origin: str) -> None:
     with service(tmp_path) as client:
         assert client.post("/v1/jobs", json=JOB, headers={"Origin": origin}).status_code == 403
-

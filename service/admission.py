@@ -21,6 +21,7 @@ from frit.sweeps.expand import expand
 
 from .jobs import NewJob, State
 from .problems import HttpError, WrongField, escaped, refused, refused_case, shown
+from .reckoning import too_much
 from .settings import Settings
 from .store import NewPoint, Store
 from .views import FileContent, JobSubmission, SweepSubmission
@@ -39,8 +40,8 @@ def job_of(submission: JobSubmission, settings: Settings) -> NewJob:
         case = checked(tree)
     except CaseError as error:
         raise refused_case(uploads.hide(error), "/case") from None
-    if (nodes := estimated_nodes(case.domain.size, case.nodes.spacing)) > settings.nodes_limit:
-        raise too_many_nodes(nodes, settings, "/case/nodes/spacing", case.nodes.spacing)
+    if wrong := [one.field("/case") for one in too_much(case.tree(), submission.ranks, settings)]:
+        raise over_limit(*wrong)
     texts = {name: texts_of(table) for name, table in case.tables().items()}
     return NewJob(
         case=case_text(case.name, texts), identity=identity(texts), ranks=submission.ranks,
@@ -87,7 +88,7 @@ def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
     try:
         sweep = parse_sweep(tree)
         check_ranks(sweep.ranks, settings, "/definition/ranks" if submission.ranks is None else "/ranks")
-        expansion = expand(sweep, settings.points_limit)
+        expansion = expand(sweep, settings.points_limit, settings.sweep_bytes_limit)
     except CaseError as error:
         raise refused_case(uploads.hide(error), "/definition", "The sweep is refused") from None
     except RecursionError:
@@ -95,9 +96,9 @@ def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
         raise refused_case(deep, "/definition", "The sweep is refused") from None
     points = []
     for point in expansion.points:
-        case = json.loads(point.case)
-        if (nodes := estimated_nodes(case["domain"]["size"], case["nodes"].get("spacing"))) > settings.nodes_limit:
-            raise too_many_nodes(nodes, settings, "/definition", None, f" ({point.name})")
+        wrong = too_much(json.loads(point.case), sweep.ranks, settings)
+        if (first := next(wrong, None)) is not None:
+            raise over_limit(first.field("/definition/base", f" ({point.name})"))
         job = NewJob(
             case=point.case, identity=point.identity, name=point.name, ranks=sweep.ranks, priority=sweep.priority,
             tags=tuple(sweep.tags), time_limit=submission.time_limit,
@@ -116,27 +117,9 @@ def check_ranks(ranks: int, settings: Settings, pointer: str) -> None:
         raise over_limit(WrongField(pointer=pointer, value=ranks, detail=allowed))
 
 
-def estimated_nodes(size: Sequence[float], spacing: float | None) -> float:
-    """Nodes of the lattice of nearest neighbours h in the box, its walls included; 0 for a mesh from a file.
-
-    Triangular: rows h sqrt(3)/2 apart; body-centred: two per cube of edge 2h / sqrt(3).
-    """
-    if spacing is None:
-        return 0.0
-    pitch = [spacing, spacing * math.sqrt(3) / 2] if len(size) == 2 else [2 * spacing / math.sqrt(3)] * 3
-    counts = [length / step + 1 for length, step in zip(size, pitch, strict=True)]
-    return math.prod(counts) * (1 if len(size) == 2 else 2)
-
-
-def too_many_nodes(nodes: float, settings: Settings, pointer: str, value: Any, where: str = "") -> HttpError:
-    """The problem of a case that is too large."""
-    allowed = f"gives about {nodes:.3g} nodes, must be at most {settings.nodes_limit}{where}"
-    return over_limit(WrongField(pointer=pointer, value=value, detail=allowed))
-
-
-def over_limit(wrong: WrongField) -> HttpError:
+def over_limit(*wrong: WrongField) -> HttpError:
     """The problem of a request that wants too much."""
-    return refused("over-limit", "More than this service allows", [wrong])
+    return refused("over-limit", "More than this service allows", wrong)
 
 
 @dataclass

@@ -55,6 +55,16 @@ class Settings(BaseSettings):
     """points of a sweep, at most"""
     nodes_limit: AtLeastOne = 20_000_000
     """nodes of a case, at most"""
+    particles_limit: AtLeastOne = 50_000
+    """particles of a case, at most"""
+    rows_limit: AtLeastOne = 1_000_000
+    """history rows of a case, at most"""
+    snapshots_limit: AtLeastOne = 10_000
+    """snapshots of a case, at most"""
+    disk_limit: AtLeastOne = 100_000_000_000
+    """bytes that the run directory of a case may be reckoned to take, at most"""
+    sweep_bytes_limit: AtLeastOne = 200_000_000
+    """bytes of all resolved cases of a sweep together, at most"""
     queue_limit: AtLeastOne = 200_000
     """jobs waiting in the queue, at most"""
 

@@ -11,11 +11,12 @@ import json
 import math
 import os
 import re
+import reprlib
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from itertools import count, pairwise, takewhile
+from itertools import count, islice, pairwise, takewhile
 from operator import ge
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -25,6 +26,7 @@ from numpy.typing import ArrayLike
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -32,19 +34,26 @@ from pydantic import (
     Tag,
     ValidationError,
     ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
     field_validator,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
-from scipy.spatial import cKDTree
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError, PydanticKnownError
 
 from . import particle_file
 from .arrays import Flags, Floats
 from .characters import UNSHOWABLE
+from .pairs import near_pairs
 from .particle_file import ParticleFileError
 
 CANONICAL = json.JSONEncoder(sort_keys=True)
 PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
+MOST_PROBLEMS = 50  # that are told of a case
+MOST_COUNTED = 1000  # that are counted beyond these
+MOST_TIMES = 1e9  # steps, rows or snapshots of a run: more never end
+LONGEST = 1e12  # model time: beyond it steps are lost in round-off
+PART = 50  # items of a list that are checked before the next are
 LONGEST_KEY = 100  # characters of an unknown key that are compared with known ones
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 
@@ -67,10 +76,50 @@ def showable(text: str) -> str:
 
 
 Text = Annotated[str, Field(strict=True), AfterValidator(showable)]
-Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
-Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
+
+
+def _few(value: object) -> object:
+    """A list of coordinates, unless it is so long that its items need no look."""
+    if isinstance(value, list | tuple) and len(value) > 3:
+        raise PydanticKnownError("too_long", {"field_type": "Tuple", "max_length": 3, "actual_length": len(value)})
+    return value
+
+
+def _in_parts(value: object, check: ValidatorFunctionWrapHandler) -> Any:
+    """A long list, checked part by part up to the first that has something wrong: no errors without end."""
+    if not isinstance(value, list | tuple) or len(value) <= PART:
+        return check(value)
+    checked: list[Any] = []
+    for start in range(0, len(value), PART):
+        try:
+            checked += check(value[start : start + PART])
+        except ValidationError as error:
+            raise _shifted(error, start) from None
+    return tuple(checked)
+
+
+def _shifted(error: ValidationError, start: int) -> ValidationError:
+    """The same errors of items that stand `start` places further on."""
+    lines: list[InitErrorDetails] = []
+    for entry in error.errors(include_url=False):
+        first, *rest = entry["loc"]
+        words = entry["msg"].replace("{", "{{").replace("}", "}}")
+        kind = PydanticCustomError(entry["type"], words)
+        lines.append({"type": kind, "loc": (int(first) + start, *rest), "input": entry["input"]})
+    return ValidationError.from_exception_data(error.title, lines)
+
+
+Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3), BeforeValidator(_few)]
+Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3), BeforeValidator(_few)]
+LONG = WrapValidator(_in_parts)
 Box = tuple[Point, Point]
 Place = tuple[str | int, ...]  # of a value in the tree: names, indices, and "|form" where it may have two
+
+
+BRIEF = reprlib.Repr()  # looks at the beginning of large values only
+BRIEF.maxlist = BRIEF.maxtuple = BRIEF.maxdict = 40
+BRIEF.maxstring = BRIEF.maxother = BRIEF.maxlong = 100
+BRIEF.maxlevel = 12
 
 
 @dataclass(frozen=True)
@@ -82,19 +131,25 @@ class Problem:
     allowed: str
 
     def __str__(self) -> str:
-        shown = text if len(text := repr(self.value)) <= 80 else text[:77] + "..."
+        shown = text if len(text := BRIEF.repr(self.value)) <= 80 else text[:77] + "..."
         return f"{self.key}{'' if self.value is None else f' = {shown}'}: {self.allowed}"
 
 
 class CaseError(ValueError):
-    """A refused case and everything that is wrong with it: one line of `str()` per problem."""
+    """A refused case and what is wrong with it: one line of `str()` per problem.
 
-    def __init__(self, problems: Iterable[Problem]) -> None:
-        self.problems = tuple(problems)
+    The first `MOST_PROBLEMS` are kept; `more` counts others, as far as they were looked for.
+    """
+
+    def __init__(self, problems: Iterable[Problem], more: int = 0) -> None:
+        found = iter(problems)
+        self.problems = tuple(islice(found, MOST_PROBLEMS))
+        self.more = more + sum(1 for _ in islice(found, MOST_COUNTED))
         super().__init__(self.problems)
 
     def __str__(self) -> str:
-        return "\n".join(map(str, self.problems))
+        lines = [*map(str, self.problems), *([f"and {self.more} more"] if self.more else [])]
+        return "\n".join(lines)
 
 
 def _refuse(problems: Iterable[Problem]) -> None:
@@ -244,11 +299,11 @@ class Particles(Table):
     """list: given here; file: a CSV, read into a list at once; packing: drawn and packed before the run"""
     shape: Literal["sphere", "box"] = "sphere"
     """box: with source = 'list' only"""
-    centres: tuple[Point, ...] = ()
+    centres: Annotated[tuple[Point, ...], LONG] = ()
     """r(a), nm: a point per particle (list)"""
-    radii: tuple[Positive, ...] = ()
+    radii: Annotated[tuple[Positive, ...], LONG] = ()
     """R_a, nm, eq. (34): one per particle (list of spheres)"""
-    sizes: tuple[Edges, ...] = ()
+    sizes: Annotated[tuple[Edges, ...], LONG] = ()
     """edge lengths, nm: one set per particle (list of boxes)"""
     path: Text | None = None
     """CSV of x,y[,z],radius, or a .cloud file of x y z r; relative to the case file (file)"""
@@ -266,7 +321,7 @@ class Particles(Table):
     truncation: Annotated[float, FINITE, Field(gt=0, le=6)] | None = None
     """radii are drawn within this many standard deviations of the mean [1], and not below a fifth of it; for
     lognormal: of the logarithm (packing; default 3)"""
-    histogram: tuple[tuple[Positive, Positive], ...] = ()
+    histogram: Annotated[tuple[tuple[Positive, Positive], ...], LONG] = ()
     """pairs of radius, nm, and weight [1], instead of mean_radius and std_radius (packing, histogram)"""
     packing_density: Fraction | None = None
     """solid fraction [1], within 0.005, of output.vacancy_box, or of the container where that box is not inside it
@@ -378,7 +433,7 @@ class Time(Table):
     owned: ClassVar = {("adaptive",): {"tolerance": 1e-3}, ("rk2",): {"step": None}}
     alone: ClassVar = ("end", "tolerance", "step")
 
-    end: Positive
+    end: Annotated[float, FINITE, Field(gt=0, le=LONGEST)]
     """t at the end of the run [1]"""
     integrator: Literal["adaptive", "rk2"] = "adaptive"
     """adaptive: with error control; rk2: two half Euler steps, eq. (32)"""
@@ -414,7 +469,7 @@ def _form(snapshots: object) -> str:
     return "|every" if isinstance(snapshots, Mapping | Every) else "|times"
 
 
-Times = Annotated[tuple[NonNegative, ...], Tag("|times")]
+Times = Annotated[tuple[NonNegative, ...], LONG, Tag("|times")]
 Snapshots = Annotated[Times | Annotated[Every, Tag("|every")], Discriminator(_form)]
 
 
@@ -611,6 +666,7 @@ def disagreements(case: Case, agreed: bool = False) -> Iterator[Problem]:
     yield from _particles_resolved(case)
     if not agreed:
         yield from _boxes_inside(case)
+    yield from _countable(case)
     yield from _times_in_order(case)
 
 
@@ -651,15 +707,19 @@ def _particles_inside(case: Case) -> Iterator[Problem]:
 def _particles_apart(case: Case) -> Iterator[Problem]:
     """R_i + R_j - |r_i - r_j| <= min(R_i, R_j) / 2; for boxes along the axis of the least overlap."""
     centres, half = case.particles.extents()
-    pairs = cKDTree(centres).query_pairs(2 * half.max(), p=np.inf, output_type="ndarray")
-    i, j = pairs[np.lexsort(pairs.T[::-1])].T
-    away, reach = np.abs(centres[i] - centres[j]), half[i] + half[j]
     boxes = case.particles.shape == "box"
-    shared = (reach - away).min(axis=1) if boxes else reach[:, 0] - np.linalg.norm(away, axis=1)
-    limit = 0.5 * np.minimum(half[i].min(axis=1), half[j].min(axis=1))
-    for p in np.flatnonzero(shared > limit * (1 + ROUND_OFF)):
-        allowed = f"overlaps particles.centres[{i[p]}] by {shared[p]:g} nm, must be at most {limit[p]:g}"
-        yield Problem(f"particles.centres[{j[p]}]", centres[j[p]].tolist(), allowed)
+    found: list[tuple[int, int, float, float]] = []
+    for i, j in (pairs.T for pairs in near_pairs(centres, half.max(axis=1))):
+        away, reach = np.abs(centres[i] - centres[j]), half[i] + half[j]
+        shared = (reach - away).min(axis=1) if boxes else reach[:, 0] - np.linalg.norm(away, axis=1)
+        limit = 0.5 * np.minimum(half[i].min(axis=1), half[j].min(axis=1))
+        wrong = np.flatnonzero(shared > limit * (1 + ROUND_OFF))[:MOST_COUNTED]
+        found += zip(*(a[wrong].tolist() for a in (i, j, shared, limit)), strict=True)
+        if len(found) > MOST_PROBLEMS:
+            break
+    for i_, j_, overlap, most in sorted(found):
+        allowed = f"overlaps particles.centres[{i_}] by {overlap:g} nm, must be at most {most:g}"
+        yield Problem(f"particles.centres[{j_}]", centres[j_].tolist(), allowed)
 
 
 def _particles_resolved(case: Case) -> Iterator[Problem]:
@@ -683,6 +743,18 @@ def _boxes_inside(case: Case) -> Iterator[Problem]:
             yield Problem(key, list(box), "must be [lower corner, upper corner], lower along every axis")
         elif any(map(_beyond, *box, size)):
             yield Problem(key, list(box), f"must be inside the domain, {list(size)}")
+
+
+def _countable(case: Case) -> Iterator[Problem]:
+    """Nothing can be done more often than `MOST_TIMES` between t = 0 and the end."""
+    output, end = case.output, case.time.end
+    least = end / MOST_TIMES
+    often = {"output.history_every": output.history_every, "time.step": case.time.step}
+    if isinstance(output.snapshots, Every):
+        often["output.snapshots.every"] = output.snapshots.every
+    for key, value in often.items():
+        if value is not None and value < least:
+            yield Problem(key, value, f"must be at least {least:g}, time.end / {MOST_TIMES:g}")
 
 
 def _times_in_order(case: Case) -> Iterator[Problem]:
@@ -730,16 +802,23 @@ def parse_case(tree: Mapping[str, Any], base: Path | None = None) -> Case:
     try:
         return Case.model_validate(tree, context={"base": base})
     except ValidationError as error:
-        raise CaseError(problems(error, _table)) from None
+        raise refusal(error, _table) from None
 
 
 def _absolute(path: str, info: ValidationInfo) -> str:
     return os.path.abspath(((info.context or {}).get("base") or Path()) / path)
 
 
-def problems(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> Iterator[Problem]:
+def refusal(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> CaseError:
     """What pydantic refused, in the words of a case file; `table_at` gives the table that holds a key."""
     entries = error.errors(include_url=False)
+    causes = [entry["ctx"]["error"] for entry in entries if isinstance(entry.get("ctx", {}).get("error"), CaseError)]
+    return CaseError(_problems(entries, table_at), sum(cause.more for cause in causes))
+
+
+def _problems(
+    entries: Sequence[ErrorDetails], table_at: Callable[[Place], type[BaseModel]]
+) -> Iterator[Problem]:
     inside = {entry["loc"][:-1] for entry in entries}
     for entry in entries:
         loc, kind, cause = entry["loc"], entry["type"], entry.get("ctx", {}).get("error")

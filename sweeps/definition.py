@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
-from frit.solver.case import CaseError, Place, Problem, Text, case_schema, problems, read_tree, unknown_part
+from frit.solver.case import CaseError, Place, Problem, Text, case_schema, read_tree, refusal, unknown_part
 
 FREE = ("name", "output.checkpoint_every")  # keys that change no result: axes along them would repeat one case
 
@@ -120,7 +120,7 @@ class Sweep(Part):
     """MPI ranks per job"""
     priority: Whole = 0
     """jobs of higher priority start first"""
-    tags: tuple[Text, ...] = ()
+    tags: Annotated[tuple[Text, ...], Field(max_length=50, fail_fast=True)] = ()
     """free labels of the jobs"""
     base: dict[str, Any]
     """a case; in a file also the path of one, relative to it. What an axis sets may be left out"""
@@ -253,7 +253,7 @@ def parse_sweep(tree: Mapping[str, Any], base: Path | None = None) -> Sweep:
     try:
         return Sweep.model_validate(_found(tree, base))
     except ValidationError as error:
-        raise CaseError(problems(error, _part)) from None
+        raise refusal(error, _part) from None
 
 
 def _found(tree: object, base: Path | None) -> object:

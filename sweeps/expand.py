@@ -64,10 +64,13 @@ def count(sweep: Sweep) -> int:
     return (sweep.sample.points or chosen) * sweep.sample.replicates
 
 
-def expand(sweep: Sweep, limit: int | None = None) -> Expansion:
-    """All points. Raises `CaseError` for more than `limit` points, before any is made, and for impossible cases."""
+def expand(sweep: Sweep, limit: int | None = None, size: int | None = None) -> Expansion:
+    """All points. Raises `CaseError` for more than `limit` points, before any is made, and for impossible cases.
+
+    size: of the text of all cases together, at most.
+    """
     with _no_collections():
-        return _expand(sweep, limit)
+        return _expand(sweep, limit, size)
 
 
 @contextmanager
@@ -82,7 +85,7 @@ def _no_collections() -> Iterator[None]:
             gc.enable()
 
 
-def _expand(sweep: Sweep, limit: int | None) -> Expansion:
+def _expand(sweep: Sweep, limit: int | None, size: int | None) -> Expansion:
     if limit is not None and (n := count(sweep)) > limit:
         raise CaseError([Problem("axes", None, f"give {n} points, must be at most {limit}")])
     with np.errstate(all="ignore"):  # what overflows is refused with its case
@@ -90,7 +93,7 @@ def _expand(sweep: Sweep, limit: int | None) -> Expansion:
     points: dict[str, Point] = {}
     refused: dict[tuple[str, str], Problem] = {}
     variations, trees = Variations(), _Trees(sweep.base, columns)
-    duplicates = bad = 0
+    duplicates = bad = written = 0
     for number, picks in enumerate(rows, start=1):
         try:
             case = variations.case(trees.tree(picks))
@@ -109,7 +112,11 @@ def _expand(sweep: Sweep, limit: int | None) -> Expansion:
         parameters = {column.key: column.shown[pick] for column, pick in zip(columns, picks, strict=True)}
         if sweep.sample.replicates > 1 and case.particles.seed is not None:
             parameters[SEED] = case.particles.seed  # the first one's may be a default
-        points[hashed] = Point(hashed, case_text(name, texts), name, parameters)
+        text = case_text(name, texts)
+        if size is not None and (written := written + len(text)) > size:
+            allowed = f"give cases of more than {size} characters together after {len(points)} points"
+            raise CaseError([Problem("axes", None, f"{allowed}: list many particles in a file")])
+        points[hashed] = Point(hashed, text, name, parameters)
     if refused:
         raise CaseError(refused.values())
     return Expansion(tuple(points.values()), duplicates)

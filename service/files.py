@@ -66,7 +66,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def stamp(path: Path) -> tuple[int, int] | None:
     """Differs once the file is replaced or written anew; None: there is none."""
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError, NotADirectoryError):
         status = path.stat()
         return status.st_ino, status.st_mtime_ns
     return None

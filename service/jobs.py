@@ -39,7 +39,7 @@ SENTENCES: Mapping[State, str] = {
     State.STARTING: "Has been given cores; its runner is on the way up.",
     State.RUNNING: "Its runner lives and has recorded itself in the run directory.",
     State.SUCCEEDED: "The solver reached the end of the case.",
-    State.FAILED: "The solver said no, and would say so again: a refused case, or fields that lost their meaning.",
+    State.FAILED: "It would end so again: a refused case, fields that lost their meaning, too much memory.",
     State.ERROR: "The machinery broke; it is tried again from the last checkpoint while attempts are left.",
     State.CANCELLED: "Somebody asked for its end; what it had computed is kept in a checkpoint.",
     State.TIMED_OUT: "It used up its time limit; what it had computed is kept in a checkpoint.",

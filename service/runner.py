@@ -175,13 +175,15 @@ class Runner:
         launch, allowed = self.launch, self.order.memory_limit * self.order.ranks
         assert launch is not None  # narrows the type
         while launch.alive:
-            if not self.at_home():
-                launch.kill()
-            elif (taken := memory_below(os.getpid(), allowed)) > allowed:
+            taken = 0
+            with suppress(OSError):  # no handle is free, say: the next look may go better
+                taken = memory_below(os.getpid(), allowed)
+            if taken > allowed:
                 self.greedy = (
                     f"its ranks took {taken / 1e9:.2f} GB of memory, more than the {allowed / 1e9:.2f} GB that "
                     f"{self.order.ranks} may (FRIT_MEMORY_LIMIT for each)"
                 )
+            if taken > allowed or not self.at_home():
                 launch.kill()
             time.sleep(LOOK_EVERY)
 

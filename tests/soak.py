@@ -25,7 +25,8 @@ from frit.service.jobs import Job, NewJob, State
 from frit.service.store import Store
 from frit.solver.case import parse_case
 
-VICTIMS = ("service", "runner", "mpirun", "rank")
+TREE = ("runner", "mpirun", "rank")
+VICTIMS = ("service", *TREE, *TREE)
 SPARED = 3  # two below the five, because a kill may come while another's end is being recorded
 
 # The engine alone, as `frit serve` and `frit sweep run` have it inside; killed and started again by the soak.
@@ -35,7 +36,7 @@ from frit.service.engine import Engine
 from frit.service.settings import Settings
 
 async def main():
-    async with Engine(Settings(data=sys.argv[1], cores=2, backoff=0.05, backoff_limit=0.2, poll=0.2)):
+    async with Engine(Settings(data=sys.argv[1], cores=4, backoff=0.05, backoff_limit=0.2, poll=0.2)):
         await asyncio.Event().wait()
 
 asyncio.run(main())
@@ -142,40 +143,38 @@ def of_kind(kind: str, data: Path, spared: Collection[str]) -> list[int]:
     return pids
 
 
-def kill_one(kind: str, running: Service, random_: random.Random) -> bool:
-    """Kill a victim of this kind; False where there is none at the moment."""
+def kill_one(kind: str, running: Service, random_: random.Random) -> str | None:
+    """Kill a victim of this kind, or of another where it is not there; which kind. None: nobody is there."""
     if kind == "service":
-        if running.process is None:
-            return False
         running.kill()
-        return True
+        return kind
     spared = [job.id for job in jobs_of(running.data) if job.failures >= SPARED]
-    pids = runners(running.data, spared) if kind == "runner" else of_kind(kind, running.data, spared)
-    if not pids:
-        return False
-    with suppress(ProcessLookupError):
-        os.kill(random_.choice(pids), signal.SIGKILL)
-        return True
-    return False
+    for other in [kind, *random_.sample(TREE, len(TREE))]:
+        pids = runners(running.data, spared) if other == "runner" else of_kind(other, running.data, spared)
+        if pids:
+            with suppress(ProcessLookupError):
+                os.kill(random_.choice(pids), signal.SIGKILL)
+                return other
+    return None
 
 
 def disturb(running: Service, kills: int, seconds: float, seed: int) -> Counter[str]:
     """Kill `kills` times, within about `seconds` if it can be; or until all jobs are done. A killed service is started
     again.
 
-    Victims of all kinds come in turn, at random; one that is not there is waited for, and no work is done meanwhile.
+    Victims of all kinds come in turn, at random; where there is none, one is waited for, and no work is done meanwhile.
     """
     random_, counts = random.Random(seed), Counter[str]()
     began = time.monotonic()
     for moment in sorted(random_.uniform(0.0, seconds) for _ in range(kills)):
         time.sleep(max(0.0, began + moment - time.monotonic()))
         kind = random_.choice(VICTIMS)
-        while not kill_one(kind, running, random_):
+        while (killed := kill_one(kind, running, random_)) is None:
             if all_done(running.data):
                 return counts
             time.sleep(0.05)
-        counts[kind] += 1
-        if kind == "service":
+        counts[killed] += 1
+        if killed == "service":
             time.sleep(random_.uniform(0.0, seconds / kills))
             running.start()
     return counts

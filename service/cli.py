@@ -89,7 +89,7 @@ def run(
     directory = out or Path("runs") / case.stem
     state = read_record(directory).get("state")
     if (directory / "run.json").exists() and state != "refused":
-        resumable = (directory / "checkpoint.h5").exists()
+        resumable = any((directory / name).exists() for name in ("checkpoint.h5", "case.json"))
         way = f"`frit resume {directory}` goes on with it" if resumable else "it has no checkpoint: remove it"
         refuse(f"--out {directory}: holds a run already (state: {state})", f"{way}, or name another folder")
     follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json, profile)
@@ -103,14 +103,16 @@ def resume(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Go on from the last checkpoint."""
+    """Go on from the last checkpoint; anew where there was none yet."""
     record = read_record(directory)
     if record.get("state") == "done":
         typer.echo(f"{directory} is done already", err=True)
         report(directory, Outcome("done", record.get("message"), 0, ""), {}, None, as_json)
         return
     if not (directory / "checkpoint.h5").exists():
-        refuse(f"{directory} has no checkpoint.h5 to go on from: start its case anew with `frit run`")
+        if not (directory / "case.json").exists():
+            refuse(f"{directory} has neither checkpoint.h5 nor case.json to go on from: run its case with `frit run`")
+        typer.echo(f"{directory} has no checkpoint yet: it is begun anew from its case.json", err=True)
     ranks = ranks or int(record.get("ranks", 1))
     follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
 

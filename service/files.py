@@ -1,6 +1,7 @@
 """Small files that outlive a crash: written beside and renamed; locks that end with their holder; who a process is."""
 
 import fcntl
+import itertools
 import json
 import os
 from contextlib import suppress
@@ -8,13 +9,23 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+numbers = itertools.count()  # of the files that this process has written beside others
+
 
 def write_json(path: Path, tree: Any, durable: bool = True) -> None:
-    """A reader sees the old file or the new one; durable: the new one is on the disk when this returns."""
-    beside = f"{path}.{os.getpid()}.new"
+    """A JSON file; see `write_whole`."""
+    write_whole(path, json.dumps(tree).encode(), durable)
+
+
+def write_whole(path: Path, content: bytes, durable: bool = True) -> None:
+    """A reader sees the old file or the new one; durable: the new one is on the disk when this returns.
+
+    Any number of threads and processes may write the same file at once: the last one stands.
+    """
+    beside = f"{path}.{os.getpid()}.{next(numbers)}.new"
     try:
         with open(beside, "wb") as file:
-            file.write(json.dumps(tree).encode())
+            file.write(content)
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
@@ -25,6 +36,14 @@ def write_json(path: Path, tree: Any, durable: bool = True) -> None:
         raise
     if durable:
         flush_folder(path.parent)
+
+
+def remove_torn(folder: Path) -> None:
+    """Remove what `write_whole` was writing in the folder for a process that has ended in the middle of it."""
+    for path in folder.glob("*.*.*.new"):
+        writer = path.name.split(".")[-3]
+        if writer.isdecimal() and start_of(int(writer)) is None:
+            path.unlink(missing_ok=True)
 
 
 def flush_folder(folder: Path) -> None:
@@ -47,15 +66,18 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def stamp(path: Path) -> tuple[int, int] | None:
     """Differs once the file is replaced or written anew; None: there is none."""
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError, NotADirectoryError):
         status = path.stat()
         return status.st_ino, status.st_mtime_ns
     return None
 
 
-def try_lock(path: Path) -> int | None:
-    """A descriptor that holds the lock as long as it, or a copy of it in any process, is open; None: it is held."""
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+def try_lock(path: Path, make: bool = True) -> int | None:
+    """A descriptor that holds the lock as long as it, or a copy of it in any process, is open; None: it is held.
+
+    make: whether to make the file where there is none; if not, that is a `FileNotFoundError`.
+    """
+    handle = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -68,6 +90,16 @@ def try_lock(path: Path) -> int | None:
 def boot() -> str:
     """The kernel's name for this boot of this machine."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def is_at(handle: int, path: Path) -> bool:
+    """Whether an open file is still the one of that name: false once it, or a folder above it, is gone or another."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:  # nobody can tell now
+        return True
 
 
 def start_of(pid: int) -> int | None:

@@ -1,9 +1,13 @@
 """Jobs: their states, one sentence each, the moves between them, and the records that travel through the service."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
+
+LONGEST_MESSAGE = 500  # characters
+PATH = re.compile(r"(?<![^\s'\"`(=:,])/(?:[^\s'\"`(),:;/]+/)+(?=[^\s'\"`(),:;/])")  # all but its last name
 
 
 class State(StrEnum):
@@ -35,11 +39,12 @@ SENTENCES: Mapping[State, str] = {
     State.STARTING: "Has been given cores; its runner is on the way up.",
     State.RUNNING: "Its runner lives and has recorded itself in the run directory.",
     State.SUCCEEDED: "The solver reached the end of the case.",
-    State.FAILED: "The solver said no, and would say so again: a refused case, or fields that lost their meaning.",
+    State.FAILED: "It would end so again: a refused case, fields that lost their meaning, too much memory.",
     State.ERROR: "The machinery broke; it is tried again from the last checkpoint while attempts are left.",
     State.CANCELLED: "Somebody asked for its end; what it had computed is kept in a checkpoint.",
     State.TIMED_OUT: "It used up its time limit; what it had computed is kept in a checkpoint.",
-    State.LOST: "Its runner vanished without an exit record; it is tried again while attempts are left.",
+    State.LOST: "Its runner vanished without an exit record, and is tried again while attempts are left; "
+    "or its run folder was deleted under it.",
 }
 
 
@@ -136,7 +141,7 @@ class Job:
     tags: tuple[str, ...]
     time_limit: float | None
     attempt: int  # number of the present or last attempt; 0 before the first
-    failures: int  # attempts in a row that broke or were lost
+    failures: int  # attempts in a row that broke or were lost and got no further than they began
     retrying: bool  # in ERROR or LOST: another attempt follows by itself
     stopping: bool  # somebody asked for the end of a job that has cores
     created: float
@@ -161,3 +166,12 @@ class Exit:
     message: str | None
     ended: float
     core_seconds: float = 0.0
+    advanced: bool = False  # it got further than the checkpoint it began from
+    again: bool = True  # whether the job may be tried again by itself
+
+
+def one_sentence(text: str) -> str:
+    """A message that may be shown to anybody: one line without control characters or folders, not too long."""
+    line = "".join(letter if letter.isprintable() else " " for letter in text.replace("\n", "; "))
+    line = PATH.sub("", " ".join(line.split()))
+    return line if len(line) <= LONGEST_MESSAGE else line[: LONGEST_MESSAGE - 3] + "..."

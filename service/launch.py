@@ -119,6 +119,7 @@ class Launch:
         environment |= {"FRIT_LAUNCH": os.urandom(16).hex(), **(marks or {})}
         self._mark = f"FRIT_LAUNCH={environment['FRIT_LAUNCH']}"
         self.directory, self.stopping, self._adopts = directory, False, adopts
+        self.marches = False  # whether the ranks have said that they step: only then can there be a new checkpoint
         self._spoken: deque[str] = deque(maxlen=40)
         self._last_resort: threading.Timer | None = None
         directory.mkdir(parents=True, exist_ok=True)
@@ -144,6 +145,7 @@ class Launch:
             with suppress(json.JSONDecodeError):
                 progress = json.loads(line)
             if isinstance(progress, dict):
+                self.marches = True
                 yield progress
             elif line.strip():
                 self._spoken.append(line.rstrip())

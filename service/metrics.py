@@ -38,9 +38,16 @@ class Jobs(Collector):
         ready = GaugeMetricFamily("frit_ready", "1 where jobs can be started and recorded.")
         ready.add_metric([], float(engine.trouble() is None))
         yield ready
-        cores = GaugeMetricFamily("frit_cores", "Processors given to jobs.")
-        cores.add_metric([], engine.settings.cores)
-        yield cores
+        scheduler = engine.scheduler
+        total, stuck = engine.settings.cores, scheduler.stuck_cores()
+        for name, words, value in (
+            ("frit_cores", "Processors given to jobs.", total),
+            ("frit_cores_busy", "Processors that jobs have now.", total - len(scheduler.free)),
+            ("frit_cores_stuck", "Processors of jobs of which nobody knows whether they live.", stuck),
+        ):
+            cores = GaugeMetricFamily(name, words)
+            cores.add_metric([], value)
+            yield cores
 
 
 def expose(app: FastAPI, engine: Callable[[], Engine], **route: Any) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 import math
 import os
 from collections.abc import Mapping
@@ -14,6 +15,8 @@ from frit.solver.case import Case, parse_case
 from .files import read_json
 from .jobs import Job
 from .store import Store
+
+logger = logging.getLogger("frit.results")
 
 
 @dataclass
@@ -48,7 +51,7 @@ class Reader:
                     self._file, place.rows, place.size = status.st_ino, 0, 0
                 file.seek(place.size)
                 added = file.read()
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return []
         whole = added[: added.rfind(b"\n") + 1]
         lines = whole.decode().splitlines()
@@ -115,10 +118,13 @@ class Follower:
             if (reader := self._readers.get(identifier)) is not None and reader.sound:
                 try:
                     rows, snapshots = await asyncio.to_thread(reader.news)
-                except ValueError:  # told at the end of the job; the others are not kept waiting
+                    progress = await asyncio.to_thread(read_json, self.runs / identifier / "progress.json")
+                except OSError as error:  # it may pass; the others are not kept waiting
+                    logger.warning("job %s: %s", identifier, error)
+                    continue
+                except Exception:  # told at the end of the job
                     reader.sound = False
                     continue
-                progress = await asyncio.to_thread(read_json, self.runs / identifier / "progress.json")
                 if progress:
                     self._progress[identifier] = progress
                 if rows or snapshots:

@@ -4,11 +4,14 @@ It has a session of its own and outlives the service. From its birth it holds th
 directory, which it inherits: whoever can take that lock knows that no runner is there, even after a reused pid or a
 crash at any moment. It leaves
 
-    attempt.json   who it is: attempt, pid, start of the process, boot, cores
+    attempt.json   who it is: attempt, pid, start of the process, boot, cores; the checkpoint it began from
     exit.json      how the attempt ended; not there where the runner was killed
 
-and obeys `request.json` when it gets TERM: a reason to stop. Runners are forked from a process that has all of Python
-that they need (`nursery`): a start costs two milliseconds, and the service itself never forks.
+and obeys `request.json` when it gets TERM: a reason to stop. It ends all that it started, and itself without a record,
+once the folder is gone from its place: what is there then is not its own.
+
+Runners are forked from a process that has all of Python that they need (`nursery`): a start costs two milliseconds,
+and the service itself never forks.
 """
 
 import ctypes
@@ -27,13 +30,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .files import boot, read_json, stamp, start_of, try_lock, write_json
-from .jobs import Exit, Move
+from .files import boot, is_at, read_json, remove_torn, stamp, start_of, try_lock, write_json
+from .jobs import Exit, Move, one_sentence
 from .launch import Launch, LaunchError, Outcome, find_mpirun, is_open_mpi, kill_marked, read_record
+from .memory import memory_below
 
 LONGEST = 65_536  # bytes of an order
 PROGRESS_EVERY = 0.5  # seconds between two writes of progress.json
+LOOK_EVERY = 1.0  # seconds between two looks at the folder, and at the memory that the ranks take
+NOTHING_TO_KEEP = 5.0  # seconds from a wish to stop to KILL where no rank steps yet, and so no checkpoint can come
 STUBBORN = 60.0  # seconds for which a record that cannot be written (a full disk) is tried again
+LOCK = "runner.lock"
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 prctl = ctypes.CDLL(None).prctl
 STOPS = {"cancelled": Move.STOP, "timed_out": Move.TIME_OUT, "released": Move.RELEASE}
@@ -49,6 +56,7 @@ class Order:
     cores: tuple[int, ...]
     time_limit: float | None
     grace: float
+    memory_limit: int  # bytes, of each rank
 
 
 # --- the nursery ------------------------------------------------------------------------------------------
@@ -86,7 +94,7 @@ def born(order: Order, lock: int) -> NoReturn:
             os.dup2(log, descriptor)
         os.close(log)
         os.set_inheritable(lock, False)
-        Runner(order, adopts).run()
+        Runner(order, lock, adopts).run()
         status = 0
     except BaseException:
         traceback.print_exc()
@@ -102,29 +110,32 @@ def born(order: Order, lock: int) -> NoReturn:
 class Runner:
     """One attempt at one job. `adopts`: whether the orphans of what it starts come to it."""
 
-    def __init__(self, order: Order, adopts: bool) -> None:
-        self.order, self.directory, self.adopts = order, Path(order.directory), adopts
-        self.mark = f"FRIT_RUN={self.directory}"
+    def __init__(self, order: Order, lock: int, adopts: bool) -> None:
+        """lock: a descriptor of the locked `runner.lock`."""
+        self.order, self.lock, self.directory, self.adopts = order, lock, Path(order.directory), adopts
+        self.mark = run_mark(self.directory)
         self.began = time.monotonic()
         self.launch: Launch | None = None
         self.reason: str | None = None  # why to stop, once there is one
+        self.greedy: str | None = None  # how the ranks took more memory than they may, once they have
         self.shown = -PROGRESS_EVERY
         signal.signal(signal.SIGTERM, lambda *_: self.stop(None))
         signal.signal(signal.SIGUSR1, lambda *_: self.checkpoint())
 
     def run(self) -> None:
-        """From the record of the start to the record of the end."""
+        """From the record of the start to that of the end. Raises `FileNotFoundError` where the folder is gone."""
         order, pid = self.order, os.getpid()
         record: dict[str, Any] = {"attempt": order.attempt, "pid": pid, "pid_start": start_of(pid), "boot": boot()}
-        record |= {"cores": order.cores, "started": time.time()}
+        record |= {"cores": order.cores, "started": time.time(), "checkpoint": checkpoint_in(self.directory)}
         self.write("attempt.json", record, durable=False)  # it tells of a process of this boot
         try:
             move, message = self.attempt()
         except Exception as error:
-            traceback.print_exc()
+            log(traceback.format_exc())
             move, message = Move.BREAK, f"runner: {type(error).__name__}: {error}"
-        seconds = (time.monotonic() - self.began) * order.ranks
-        self.write("exit.json", asdict(Exit(order.attempt, move, message, time.time(), seconds)))
+        seconds, further = (time.monotonic() - self.began) * order.ranks, advanced(self.directory, order.attempt)
+        end = Exit(order.attempt, move, message and one_sentence(message), time.time(), seconds, further)
+        self.write("exit.json", asdict(end))
 
     def attempt(self) -> tuple[Move, str | None]:
         """Run mpirun to its end; what came of it."""
@@ -149,10 +160,36 @@ class Runner:
                 self.descend()
             if self.order.time_limit is not None:
                 timer(self.order.time_limit, lambda: self.stop("timed_out"))
+            threading.Thread(target=self.look_after, daemon=True).start()
             for progress in launch:
                 self.show(progress)
             outcome = launch.wait()
+        if outcome.retry and outcome.errors:
+            log(outcome.errors)  # which may name paths
+        if self.greedy is not None and outcome.state != "done":
+            return Move.FAIL, self.greedy
         return judge(outcome, self.reason)
+
+    def look_after(self) -> None:
+        """Kill all ranks where the folder has gone, or where they take more memory than they may."""
+        launch, allowed = self.launch, self.order.memory_limit * self.order.ranks
+        assert launch is not None  # narrows the type
+        while launch.alive:
+            taken = 0
+            with suppress(OSError):  # no handle is free, say: the next look may go better
+                taken = memory_below(os.getpid(), allowed)
+            if taken > allowed:
+                self.greedy = (
+                    f"its ranks took {taken / 1e9:.2f} GB of memory, more than the {allowed / 1e9:.2f} GB that "
+                    f"{self.order.ranks} may (FRIT_MEMORY_LIMIT for each)"
+                )
+            if taken > allowed or not self.at_home():
+                launch.kill()
+            time.sleep(LOOK_EVERY)
+
+    def at_home(self) -> bool:
+        """Whether the run folder is still the one that this runner was started in."""
+        return is_at(self.lock, self.directory / LOCK)
 
     def arguments(self) -> list[str]:
         """Of the solver."""
@@ -169,6 +206,7 @@ class Runner:
         """End what an earlier attempt left behind, before its solver can get in this one's way."""
         while kill_marked(self.mark):
             time.sleep(0.01)
+        remove_torn(self.directory)
         deadline = time.monotonic() + 10.0
         while (lock := try_lock(self.directory / "lock")) is None:
             if time.monotonic() > deadline:
@@ -194,19 +232,24 @@ class Runner:
             self.launch.checkpoint()
 
     def descend(self) -> None:
-        """USR1, a grace for the checkpoint; TERM, a grace for the end; KILL."""
+        """USR1, a grace for the checkpoint; TERM, a grace for the end; KILL.
+
+        Where no rank steps, and so there is nothing new to keep: TERM, `NOTHING_TO_KEEP`, KILL.
+        """
         threading.Thread(target=self._descend, daemon=True).start()
 
     def _descend(self) -> None:
-        assert self.launch is not None  # narrows the type: there is no ladder without a launch
-        path = self.directory / "checkpoint.h5"
-        before = stamp(path)
-        with suppress(ProcessLookupError):
-            self.launch.checkpoint()
-            deadline = time.monotonic() + self.order.grace
-            while stamp(path) == before and time.monotonic() < deadline and self.launch.alive:
-                time.sleep(0.02)
-            self.launch.stop(self.order.grace)
+        launch, grace = self.launch, self.order.grace
+        assert launch is not None  # narrows the type: there is no ladder without a launch
+        if launch.marches:
+            before = checkpoint_in(self.directory)
+            launch.checkpoint()
+            await_(lambda: checkpoint_in(self.directory) != before or not launch.alive, grace)
+            launch.stop(grace)
+        else:
+            launch.stop(grace)
+            if not await_(lambda: launch.marches or not launch.alive, min(grace, NOTHING_TO_KEEP)):
+                launch.kill()
 
     def show(self, progress: dict[str, Any]) -> None:
         """Keep the solver's last progress line where the service finds it."""
@@ -221,11 +264,13 @@ class Runner:
         deadline = time.monotonic() + STUBBORN
         while True:
             try:
+                if not self.at_home():
+                    raise FileNotFoundError(f"{self.directory}: is gone, or another stands in its place")
                 return write_json(self.directory / name, tree, durable)
             except OSError:
-                if time.monotonic() > deadline:
+                if time.monotonic() > deadline or not self.at_home():
                     raise
-                time.sleep(1.0)
+                time.sleep(LOOK_EVERY)
 
 
 def judge(outcome: Outcome, reason: str | None) -> tuple[Move, str | None]:
@@ -236,8 +281,9 @@ def judge(outcome: Outcome, reason: str | None) -> tuple[Move, str | None]:
         return STOPS[reason], outcome.message
     if outcome.state == "interrupted":
         return Move.RELEASE, outcome.message
-    message = "\n".join(filter(None, [outcome.message, outcome.errors if outcome.retry else None]))
-    return (Move.BREAK if outcome.retry else Move.FAIL), message or None
+    if outcome.state == "refused" and outcome.retry:
+        return Move.BREAK, "another process is running in the run folder"
+    return (Move.BREAK if outcome.retry else Move.FAIL), outcome.message
 
 
 def read_exit(directory: Path, attempt: int) -> Exit | None:
@@ -249,6 +295,39 @@ def read_exit(directory: Path, attempt: int) -> Exit | None:
         return Exit(**{**record, "move": Move(record["move"])})
     except (LookupError, TypeError, ValueError):  # damaged: as good as none
         return None
+
+
+def log(text: str) -> None:
+    """Into runner.log, if the disk has room."""
+    with suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def checkpoint_in(directory: Path) -> list[int] | None:
+    """Differs, once there is another checkpoint, from what it was before; as JSON keeps it."""
+    found = stamp(directory / "checkpoint.h5")
+    return None if found is None else list(found)
+
+
+def advanced(directory: Path, attempt: int) -> bool:
+    """Whether an attempt has left a checkpoint that is not the one it began from."""
+    record, now = read_json(directory / "attempt.json"), checkpoint_in(directory)
+    return now is not None and record.get("attempt") == attempt and record.get("checkpoint", now) != now
+
+
+def run_mark(directory: Path) -> str:
+    """NAME=VALUE in the environment of all that a runner starts in a run directory."""
+    return f"FRIT_RUN={directory}"
+
+
+def await_(happened: Callable[[], bool], seconds: float) -> bool:
+    """Whether it happened within that time."""
+    deadline = time.monotonic() + seconds
+    while not happened():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
 
 
 def timer(seconds: float, call: Callable[[], None]) -> None:

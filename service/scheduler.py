@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import os
 import shutil
 import signal
 import time
@@ -10,18 +9,19 @@ from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
-from .backends.local import BackendError, LocalBackend
-from .files import boot, start_of, write_json
+from .backends.local import BackendError, FolderError, LocalBackend, Process
+from .files import boot, start_of, write_json, write_whole
 from .hub import Hub
-from .jobs import Exit, Job, Move, State
+from .jobs import Exit, Job, Move, State, one_sentence
 from .results import Follower
-from .runner import Order
+from .runner import Order, advanced
 from .settings import Settings, own_cores
-from .store import Store, StoreError
+from .store import Attempt, NotFoundError, Store, StoreError
 
 AHEAD = 256  # jobs of the queue that one tick looks at
 TICK = 1.0  # seconds between two ticks when nothing happens
-AGAIN = 1.0  # seconds before a piece of work that the index refused is tried again
+AGAIN = 1.0  # seconds before a piece of work that the index refused, or that failed, is tried again
+READINGS = 5  # times that what a job has left behind is read in vain before it ends without
 
 logger = logging.getLogger("frit.scheduler")
 
@@ -56,11 +56,24 @@ class Scheduler:
         self.cores = [own[k % len(own)] for k in range(settings.cores)]
         self.free = set(range(settings.cores))  # numbers of self.cores
         self.running: dict[str, Job] = {}  # with cores, by id
-        self.trouble: str | None = "starting up"
+        self.held: dict[str, set[int]] = {}  # the cores of those
+        self.stuck: dict[str, str] = {}  # jobs whose watch has failed, and how: nobody knows whether they live
         self.open = True  # whether to start jobs
+        self._said: str | None = "starting up"
+        self._closing = False
         self._tasks: set[asyncio.Task[None]] = set()
         self._births: set[asyncio.Task[int]] = set()  # of runners
         self._first: tuple[int, float] | None = None  # the job that waits for cores, and since when
+
+    @property
+    def trouble(self) -> str | None:
+        """Why no job can be started or recorded now, or cores are held by what may not live; None: all is well."""
+        stuck = [f"job {job}: its watch has failed: {reason}" for job, reason in self.stuck.items()]
+        return "; ".join(stuck[:3]) or self._said
+
+    def stuck_cores(self) -> int:
+        """How many cores are held by jobs of which nobody knows whether they live."""
+        return sum(len(self.held.get(job, ())) for job in self.stuck)
 
     # --- the loop -----------------------------------------------------------------------------------------
 
@@ -69,12 +82,13 @@ class Scheduler:
         held, waiting = await asyncio.to_thread(self.store.unfinished)
         for job, attempt in held:
             cores = self._cores_again(attempt.cores)
-            self.running[job.id] = job
+            self.running[job.id], self.held[job.id] = job, cores
             self.follower.follow(job)
-            self._spawn(self._adopt(job, cores))
+            message = "the service ended before it had started a runner"
+            self._attend(job, self._adopt(job, attempt, Exit(job.attempt, Move.RELEASE, message, time.time())))
         for job in waiting:
             self._spawn(self._pause(job))
-        self.trouble = None
+        self._said = None
 
     async def run(self) -> None:
         """Tick when something has happened, and once in a while; trouble with the index passes or is shown."""
@@ -83,12 +97,12 @@ class Scheduler:
             seen = self.hub.count
             try:
                 await self.tick()
-                self.trouble = self._disk()
+                self._said = self._disk()
             except (StoreError, OSError) as error:
                 self._complain(str(error))
             except Exception as error:  # not foreseen: the next tick may go better, and all running jobs depend on it
                 logger.exception("a tick has failed")
-                self.trouble = f"{type(error).__name__}: {error}"
+                self._said = f"{type(error).__name__}: {error}"
             await self.hub.wait(TICK, seen)
 
     async def tick(self) -> None:
@@ -106,9 +120,10 @@ class Scheduler:
         claim = self.store.claim([(seq, tuple(self.cores[k] for k in numbers)) for seq, numbers in choices])
         given = dict(choices)
         for job in await asyncio.wrap_future(claim):
-            self.free -= set(given[job.seq])
+            self.held[job.id] = set(given[job.seq])
+            self.free -= self.held[job.id]
             self.running[job.id] = job
-            self._spawn(self._start(job, set(given[job.seq])))
+            self._attend(job, self._start(job))
 
     def _ahead(self, free: int) -> list[tuple[int, int]]:
         """(seq, ranks) of the first in the queue: as many as there are cores free where those fit, else `AHEAD`."""
@@ -126,7 +141,8 @@ class Scheduler:
         directory = self.settings.runs / job.id
         request = {"attempt": job.attempt, "stop": reason}
         try:
-            await asyncio.to_thread(directory.mkdir, parents=True, exist_ok=True)  # its runner may be on the way up
+            if job.state is State.STARTING:  # its runner may be on the way up
+                await asyncio.to_thread(directory.mkdir, parents=True, exist_ok=True)
             await asyncio.to_thread(write_json, directory / "request.json", request)
         except OSError as error:  # a full disk: it is released then, and the index knows what else was wanted
             self._complain(f"job {job.id}: {error}")
@@ -147,7 +163,7 @@ class Scheduler:
 
     async def close(self) -> None:
         """Leave; the runners go on, those on the way up too."""
-        self.open = False
+        self.open, self._closing = False, True
         await asyncio.gather(*self._births, return_exceptions=True)
         for task in self._tasks:
             task.cancel()
@@ -156,11 +172,11 @@ class Scheduler:
 
     # --- one job ------------------------------------------------------------------------------------------
 
-    async def _start(self, job: Job, cores: set[int]) -> None:
+    async def _start(self, job: Job) -> None:
         directory = self.settings.runs / job.id
         order = Order(
-            job.attempt, str(directory), job.ranks, tuple(self.cores[k] for k in sorted(cores)), job.time_limit,
-            self.settings.grace,
+            job.attempt, str(directory), job.ranks, tuple(self.cores[k] for k in sorted(self.held[job.id])),
+            job.time_limit, self.settings.grace, self.settings.memory_limit,
         )  # fmt: skip
         self.follower.follow(job)
         try:
@@ -168,73 +184,107 @@ class Scheduler:
             self._births.add(birth)
             birth.add_done_callback(self._births.discard)
             pid = await asyncio.shield(birth)
+        except FolderError as error:
+            return await self._lose(job, error)
         except (BackendError, OSError) as error:
             logger.warning("job %s: %s", job.id, error)
-            record = await self.backend.recorded(directory, job.attempt) if directory.is_dir() else None
+            record = await self._recorded(job)
             if record is None:
-                return await self._end(job, cores, Exit(job.attempt, Move.BREAK, str(error), time.time()))
+                return await self._end(job, Exit(job.attempt, Move.BREAK, one_sentence(str(error)), time.time()))
             pid = int(record["pid"])  # it was forked all the same: only the answer was lost
-        beside = None
+        process, beside = None, None
         if (started := start_of(pid)) is not None:
-            beside = self._spawn(self._started(job, pid, started, boot()))
-        await self._watch(job, cores, pid, beside)
+            process = Process(pid, started, boot())
+            beside = self._spawn(self._started(job, process))
+        await self._watch(job, process, beside)
 
     async def _bear(self, job: Job, order: Order) -> int:
         """Not to be cut short: a claimed job gets its runner."""
         await asyncio.to_thread(make_directory, Path(order.directory), job)
         return await self.backend.start(order)
 
-    async def _started(self, job: Job, pid: int, pid_start: int, boot_id: str) -> None:
-        recorded = await self._insist(lambda: self.store.start(job.id, job.attempt, pid, pid_start, boot_id))
+    async def _recorded(self, job: Job) -> dict[str, Any] | None:
+        """What the attempt's runner has recorded of itself; None where there is none, or no folder."""
+        try:
+            return await self.backend.recorded(self.settings.runs / job.id, job.attempt)
+        except FolderError:
+            return None
+
+    async def _started(self, job: Job, process: Process) -> None:
+        recorded = await self._insist(lambda: self.store.start(job.id, job.attempt, *process))
         if recorded.attempt == job.attempt and job.id in self.running:
             self.running[job.id] = recorded
             if recorded.stopping:  # the wish came before there was a runner to tell
                 await self.stop(recorded, "cancelled")
 
-    async def _adopt(self, job: Job, cores: set[int]) -> None:
-        """Watch a runner that an earlier service has started, unless it did not come to that."""
-        directory = self.settings.runs / job.id
-        directory.mkdir(parents=True, exist_ok=True)
-        record = await self.backend.recorded(directory, job.attempt)
+    async def _adopt(self, job: Job, attempt: Attempt, unborn: Exit) -> None:
+        """Watch a runner that was started before; `unborn`: what is said where it did not come to that."""
+        record, process = await self._recorded(job), process_of(attempt)
         if record is None and job.state is State.STARTING:
-            message = "the service ended before it had started a runner"
-            return await self._end(job, cores, Exit(job.attempt, Move.RELEASE, message, time.time()))
+            await self.backend.clear(self.settings.runs / job.id, process)  # of one whose folder is gone
+            return await self._end(job, unborn)
         if record is not None:
-            await self._started(job, record["pid"], record["pid_start"], record["boot"])
-        await self._watch(job, cores)
+            process = Process(record["pid"], record["pid_start"], record["boot"])
+            await self._started(job, process)
+        await self._watch(job, process)
 
-    async def _watch(
-        self, job: Job, cores: set[int], pid: int | None = None, beside: asyncio.Task[None] | None = None
-    ) -> None:
+    async def _watch(self, job: Job, process: Process | None = None, beside: asyncio.Task[None] | None = None) -> None:
         """To the end of the job's runner, which may have come already; `beside`: what has to be told before that."""
         directory = self.settings.runs / job.id
-        end = await self.backend.ended(directory, job.attempt, pid)
+        pid = None if process is None or beside is None else process.pid
+        try:
+            end = await self.backend.ended(directory, job.attempt, pid, lambda: self._well(job))
+        except FolderError as error:
+            return await self._lose(job, error, process)
         if beside is not None:
             await asyncio.wait([beside])
         if end is None:
-            end = Exit(job.attempt, Move.LOSE, "the runner vanished without an exit record", time.time())
-        await self._end(job, cores, end)
+            message, further = "the runner vanished without an exit record", advanced(directory, job.attempt)
+            end = Exit(job.attempt, Move.LOSE, message, time.time(), advanced=further)
+        await self._end(job, end)
 
-    async def _end(self, job: Job, cores: set[int], end: Exit) -> None:
+    async def _lose(self, job: Job, error: FolderError, process: Process | None = None) -> None:
+        """For good: there is nothing left to go on with, and nobody is to compute into the void."""
+        await self.backend.clear(self.settings.runs / job.id, process)
+        await self._end(job, Exit(job.attempt, Move.LOSE, str(error), time.time(), again=False))
+
+    async def _end(self, job: Job, end: Exit) -> None:
         """Into the index with it, history first, and its cores back."""
-        result: dict[str, Any] = {}
-        while True:
-            try:
-                result = await self.follower.finish(job)
-                break
-            except (StoreError, OSError) as error:
-                self._complain(f"job {job.id}: {error}")
-                await asyncio.sleep(AGAIN)
-            except Exception as error:  # a damaged file: the job has ended all the same
-                logger.warning("job %s: %s: %s", job.id, type(error).__name__, error)
-                break
+        result = await self._results(job)
         limit = self.settings.attempts
-        ended = await self._insist(lambda: self.store.finish(job.id, end, limit, result or None))
-        self.running.pop(job.id, None)
-        self.free |= cores
-        if ended.retrying:
+        try:
+            ended = await self._insist(lambda: self.store.finish(job.id, end, limit, result or None))
+        except NotFoundError as error:  # taken out of the index under the service: it has ended all the same
+            logger.warning("%s", error)
+            ended = None
+        self._give_back(job)
+        if ended is not None and ended.retrying:
             self._spawn(self._pause(ended))
         self.hub.notify()
+
+    async def _results(self, job: Job) -> dict[str, Any]:
+        """Take in the last of what a job has left; what it is found by. What cannot be read is told, and no more."""
+        failures = 0
+        while True:
+            try:
+                return await self.follower.finish(job)
+            except StoreError as error:
+                self._complain(f"job {job.id}: {error}")
+            except OSError as error:
+                self._complain(f"job {job.id}: {error}")
+                failures += 1
+            except Exception as error:  # a damaged file: the job has ended all the same
+                logger.warning("job %s: %s: %s", job.id, type(error).__name__, error)
+                return {}
+            if failures == READINGS:
+                return {}
+            await asyncio.sleep(AGAIN)
+
+    def _give_back(self, job: Job) -> None:
+        """Free what a job that has ended had."""
+        self.running.pop(job.id, None)
+        self.free |= self.held.pop(job.id, set())
+        self._well(job)
 
     async def _pause(self, job: Job) -> None:
         """Between two attempts; measured by a clock that does not jump."""
@@ -257,9 +307,36 @@ class Scheduler:
             try:
                 await self.follower.look({identifier: job.seq for identifier, job in self.running.items()})
                 self.hub.notify()
-            except (StoreError, OSError, ValueError) as error:
+            except StoreError as error:
                 self._complain(str(error))
+            except Exception as error:  # not foreseen: all running jobs depend on the next look
+                logger.exception("what jobs have written could not be taken in")
+                self._complain(f"{type(error).__name__}: {error}")
             await asyncio.sleep(self.settings.poll)
+
+    def _attend(self, job: Job, work: Coroutine[Any, Any, None]) -> None:
+        """Have work bring a job to its end; where it fails itself, that is told, and the job watched again."""
+        self._spawn(work).add_done_callback(lambda task: self._unattended(job, task))
+
+    def _unattended(self, job: Job, task: asyncio.Task[None]) -> None:
+        """Its work is over, but is the job?"""
+        if self._closing or self.running.get(job.id, job).attempt != job.attempt or job.id not in self.held:
+            return
+        error = None if task.cancelled() else task.exception()
+        self.stuck[job.id] = "it was cut short" if error is None else f"{type(error).__name__}: {error}"
+        self._attend(job, self._again(job))
+
+    async def _again(self, job: Job) -> None:
+        """Watch a job whose watch has failed; where there was no runner yet, that will be found."""
+        await asyncio.sleep(AGAIN)
+        attempt = (await asyncio.to_thread(self.store.attempts, job.id))[-1]
+        broken = Exit(job.attempt, Move.BREAK, one_sentence(f"its start failed: {self.stuck.get(job.id)}"), time.time())
+        await self._adopt(self.running[job.id], attempt, broken)
+
+    def _well(self, job: Job) -> None:
+        """It is known again whether the job lives."""
+        if self.stuck.pop(job.id, None) is not None:
+            logger.warning("job %s: is watched again", job.id)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
@@ -271,12 +348,12 @@ class Scheduler:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             logger.error("a watch has ended by itself", exc_info=error)
-            self.trouble = f"{type(error).__name__}: {error}"
+            self._said = f"{type(error).__name__}: {error}"
 
     def _complain(self, text: str) -> None:
-        if self.trouble != text:
+        if self._said != text:
             logger.warning("%s", text)
-        self.trouble = text
+        self._said = text
 
     def _disk(self) -> str | None:
         free = shutil.disk_usage(self.settings.data).free
@@ -299,9 +376,14 @@ def make_directory(directory: Path, job: Job) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     submitted = directory / "submitted.json"
     if not submitted.exists():
-        beside = submitted.with_name("submitted.json.new")
-        beside.write_text(job.case)
-        os.replace(beside, submitted)
+        write_whole(submitted, job.case.encode(), durable=False)
     keys = ("seq", "id", "identity", "name", "ranks", "priority", "tags", "time_limit", "created")
     record = {key: getattr(job, key) for key in keys}
     write_json(directory / "job.json", record, durable=False)
+
+
+def process_of(attempt: Attempt) -> Process | None:
+    """The runner of an attempt, as the index has it; None before that was told."""
+    if attempt.pid is None or attempt.pid_start is None or attempt.boot is None:
+        return None
+    return Process(attempt.pid, attempt.pid_start, attempt.boot)

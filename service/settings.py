@@ -7,6 +7,8 @@ from typing import Annotated
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from .memory import memory_per_core
+
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -30,7 +32,8 @@ class Settings(BaseSettings):
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """port to listen on; 0: any free one"""
     attempts: AtLeastOne = 5
-    """attempts in a row that may break or get lost before a job stays in `error` or `lost`"""
+    """attempts in a row that may break or get lost before a job stays in `error` or `lost`; one that got further than
+    the checkpoint it began from does not count"""
     backoff: Seconds = 2.0
     """seconds before the second attempt; doubles with each one after"""
     backoff_limit: Seconds = 300.0
@@ -39,6 +42,8 @@ class Settings(BaseSettings):
     """seconds for which smaller jobs may overtake the first in the queue while it waits for more cores"""
     grace: Seconds = 60.0
     """seconds for each step of the ladder checkpoint, end, kill when a job is stopped"""
+    memory_limit: AtLeastOne = Field(default_factory=memory_per_core)
+    """bytes of memory for each rank of a job; one whose ranks together take more is ended and has failed"""
     release: bool = False
     """at the end of the service, jobs write a checkpoint and go back into the queue instead of running on"""
     poll: Seconds = 0.5

@@ -916,13 +916,13 @@ def _finish(t: Transaction, wanted: Sequence[_End]) -> list[Job | NotFoundError]
         broke, move = end.move in (Move.BREAK, Move.LOSE), end.move
         if job.stopping and move in (Move.BREAK, Move.LOSE, Move.RELEASE):  # nobody wants it any more
             broke, move = False, Move.STOP
-        state, failures = after(job.state, move), job.failures + 1 if broke else 0
+        state, failures = after(job.state, move), job.failures + 1 if broke and not end.advanced else 0
         ended = {"ended": end.ended, "state": state, "message": end.message, "core_seconds": end.core_seconds}
         rows.append(_of_attempt(t, job, ended))
         if each.result is not None:
             results[job.seq] = each.result
         known[each.job] = moves.add(
-            job, move, end.message, failures=failures, retrying=broke and failures < each.attempts_limit,
+            job, move, end.message, failures=failures, retrying=broke and end.again and failures < each.attempts_limit,
             stopping=False, ended=None if state is State.QUEUED else end.ended,
             core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
         )  # fmt: skip

@@ -1,4 +1,5 @@
-"""`mpirun -n N python -P -m frit.solver CASE --out DIR` runs a case, `... --resume DIR` goes on with one.
+"""`mpirun -n N python -P -m frit.solver CASE --out DIR` runs a case, `... --resume DIR` goes on with one, or begins it
+anew where it was killed before its first checkpoint.
 
 Signals: USR1 writes a checkpoint, TERM and INT write one and end the run. The end is told by run.json (`state`:
 running, done, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
@@ -23,6 +24,7 @@ from . import checkpoint, output, slots
 from .arrays import Floats
 from .case import Case, CaseError, load_case
 from .checkpoint import Checkpoint, CheckpointError
+from .failure import comes_again, told
 from .geometry import Mesh, MeshError
 from .integrators import Integrator
 from .observe import Observables
@@ -38,6 +40,7 @@ from .state import State
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
 SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
+ANEW = "it was stopped before its first checkpoint: begun anew from case.json"
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
@@ -97,11 +100,10 @@ def execute(
     arguments: argparse.Namespace, ranks: Ranks, directory: Path, requests: Requests
 ) -> tuple[str, str | None]:
     """The whole run: how it ended, and a message where it did not end well."""
-    fresh = arguments.resume is None
-    asked: Case = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
+    asked, fresh = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
     placed = ranks.from_root(place_or_stop(asked, directory, fresh, requests) if ranks.root else None)
     if placed is None:
-        return "interrupted", "while the particles were packed: nothing to resume, run it again"
+        return "interrupted", "while the particles were packed: nothing is kept yet"
     case, packing = placed
     rows = fresh or ranks.from_root(checkpoint.by_rows(directory) if ranks.root else None)
     mesh, identity = build_mesh(case, ranks, rows), asked.identity()
@@ -109,6 +111,8 @@ def execute(
     scheme, state, integrator = start(case, mesh, ranks, kept)
     if ranks.root:
         record_start(directory, asked, ranks.size, fresh, packing)
+        if fresh and arguments.resume is not None:
+            record_note(directory, ANEW)
     while True:
         wall_time = kept.wall_time if kept else None
         recorder = Recorder(directory, mesh, scheme, state, identity, wall_time, requests, arguments.progress)
@@ -152,25 +156,28 @@ def place_or_stop(
         return None
 
 
-def open_directory(arguments: argparse.Namespace, directory: Path) -> Case:
-    """Rank 0: lock the run directory, and write or read its case. Whoever has not the lock writes nothing there."""
-    fresh = arguments.resume is None
-    if fresh:
+def open_directory(arguments: argparse.Namespace, directory: Path) -> tuple[Case, bool]:
+    """Rank 0: lock the run directory, and write or read its case; whether the run is a fresh one.
+
+    Whoever has not the lock writes nothing there.
+    """
+    resumed = arguments.resume is not None
+    if not resumed:
         directory.mkdir(parents=True, exist_ok=True)
     elif not directory.is_dir():
         raise output.DirectoryError(f"{directory}: no such folder")
     output.lock(directory)
-    if (directory / checkpoint.NAME).exists() == fresh:
-        if fresh:
-            raise output.DirectoryError(f"{directory}: holds a run already; go on with --resume")
-        raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from")
-    for torn in directory.glob("*.new"):  # what was being written when the run was killed
-        torn.unlink()
-    if not fresh:
-        return load_case(directory / "case.json")
+    kept, path = (directory / checkpoint.NAME).exists(), directory / "case.json"
+    if kept and not resumed:
+        raise output.DirectoryError(f"{directory}: holds a run already; go on with --resume")
+    if resumed and not (kept or path.exists()):
+        raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from, and no {path.name} to begin with")
+    output.remove_torn(directory)
+    if resumed:
+        return load_case(path), not kept
     case = load_case(arguments.case)
-    (directory / "case.json").write_text(case.resolved_json())
-    return case
+    output.write_text(path, case.resolved_json())
+    return case, True
 
 
 class Recorder:
@@ -334,7 +341,7 @@ def give_up(error: BaseException, ranks: Ranks, directory: Path) -> int:
     """Write down what went wrong on this rank, and end all ranks, even where it cannot be written down."""
     refused = isinstance(error, REFUSALS)
     where = f"rank {ranks.rank}: " if ranks.size > 1 and not refused else ""
-    message = f"{where}{error}" if refused else f"{where}{type(error).__name__}: {error}"
+    message = str(error) if refused else f"{where}{told(error)}"
     state = "refused" if refused else "failed"
     try:
         if isinstance(error, output.DirectoryError):
@@ -344,7 +351,7 @@ def give_up(error: BaseException, ranks: Ranks, directory: Path) -> int:
             traceback.print_exception(error)
             with open(directory / "log.txt", "a") as log:
                 log.write(where + "".join(traceback.format_exception(error)))
-        record_end(directory, state, message, retry=not refused)
+        record_end(directory, state, message, retry=not (refused or comes_again(error)))
     finally:
         if ranks.size > 1:
             time.sleep(SPOKEN)

@@ -57,12 +57,15 @@ def write(
         return
     fields |= {"slot_of": state.slot_of, "reference_slot_of": scheme.before.slot_of, "motion": scheme.carried}
     beside = directory / (NAME + ".new")
-    with h5py.File(beside, "w") as file:
-        for name, values in fields.items():
-            file[name] = values
-        file["u"].attrs["columns"] = "rho, then slots of eta; owner[:, s] is the particle of column 1 + s, -1: none"
-        file.attrs.update(format=FORMAT, time=state.time, step=state.step, evaluations=state.evaluations)
-        file.attrs.update(nodes=len(mesh.nodes), mesh=mesh_hash(mesh), notes=json.dumps(notes))
+    try:
+        with h5py.File(beside, "w") as file:
+            for name, values in fields.items():
+                file[name] = values
+            file["u"].attrs["columns"] = "rho, then slots of eta; owner[:, s] is the particle of column 1 + s, -1: none"
+            file.attrs.update(format=FORMAT, time=state.time, step=state.step, evaluations=state.evaluations)
+            file.attrs.update(nodes=len(mesh.nodes), mesh=mesh_hash(mesh), notes=json.dumps(notes))
+    except (KeyError, RuntimeError, ValueError) as error:  # HDF5's words for a disk that is full, among others
+        raise OSError(f"{NAME} could not be written: {error}") from error
     replace_durably(beside, directory / NAME)
 
 

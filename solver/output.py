@@ -24,11 +24,26 @@ class DirectoryError(ValueError):
     """A run directory that cannot be used; the message says why."""
 
 
+OWN = ("case.json", "checkpoint.h5", "history.jsonl", "particles.csv", "run.json")  # files that the solver replaces
+
+
 def write_json(path: Path, tree: Any) -> None:
+    """A JSON file; see `write_text`."""
+    write_text(path, json.dumps(tree, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
     """Write beside, make durable, rename; safe where several ranks do so at once."""
     beside = path.with_name(f"{path.name}.{os.getpid()}.new")
-    beside.write_text(json.dumps(tree, indent=2) + "\n")
+    beside.write_text(text)
     replace_durably(beside, path)
+
+
+def remove_torn(directory: Path) -> None:
+    """Remove what a solver was writing when it was killed; by who has the lock. Others write beside files as well."""
+    for name in OWN:
+        for torn in directory.glob(f"{name}*.new"):
+            torn.unlink(missing_ok=True)
 
 
 def now() -> str:

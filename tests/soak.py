@@ -1,4 +1,8 @@
-"""A sweep of small real runs, while service, runners, mpiruns and ranks are killed at random moments."""
+"""A sweep of small real runs, while service, runners, mpiruns and ranks are killed at random moments.
+
+The service has its five attempts. Kills come faster than solvers start, and five in a row before a job gets further end
+it, as the service promises: a job that has broken `SPARED` times in a row is no victim until it has got further.
+"""
 
 import json
 import os
@@ -8,8 +12,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +25,9 @@ from frit.service.jobs import Job, NewJob, State
 from frit.service.store import Store
 from frit.solver.case import parse_case
 
-VICTIMS = ("service", "runner", "mpirun", "rank")
+TREE = ("runner", "mpirun", "rank")
+VICTIMS = ("service", *TREE, *TREE)
+SPARED = 3  # two below the five, because a kill may come while another's end is being recorded
 
 # The engine alone, as `frit serve` and `frit sweep run` have it inside; killed and started again by the soak.
 SERVICE = """
@@ -29,7 +36,7 @@ from frit.service.engine import Engine
 from frit.service.settings import Settings
 
 async def main():
-    async with Engine(Settings(data=sys.argv[1], cores=2, attempts=1000, backoff=0.05, backoff_limit=0.2, poll=0.2)):
+    async with Engine(Settings(data=sys.argv[1], cores=4, backoff=0.05, backoff_limit=0.2, poll=0.2)):
         await asyncio.Event().wait()
 
 asyncio.run(main())
@@ -112,10 +119,10 @@ def of_data(data: Path) -> list[psutil.Process]:
     return found
 
 
-def runners(data: Path) -> list[int]:
-    """Pids of living runners; one that has ended and waits for its parent's notice lives no more."""
+def runners(data: Path, spared: Collection[str] = ()) -> list[int]:
+    """Pids of living runners of other jobs; one that has ended and waits for its parent's notice lives no more."""
     living = []
-    for record in map(read_json, data.glob("runs/*/attempt.json")):
+    for record in [read_json(path) for path in data.glob("runs/*/attempt.json") if path.parent.name not in spared]:
         with suppress(psutil.Error):
             same = start_of(record["pid"]) == record["pid_start"]
             if same and psutil.Process(record["pid"]).status() != psutil.STATUS_ZOMBIE:
@@ -123,49 +130,51 @@ def runners(data: Path) -> list[int]:
     return living
 
 
-def kill_one(kind: str, running: Service, random_: random.Random) -> bool:
-    """Kill a victim of this kind; False where there is none at the moment."""
+def of_kind(kind: str, data: Path, spared: Collection[str]) -> list[int]:
+    """Pids of the mpiruns, or of the ranks, of other jobs."""
+    pids = []
+    for process in of_data(data):
+        with suppress(psutil.Error):
+            line, job = process.cmdline(), Path(process.environ()["FRIT_RUN"]).name
+            first = Path(line[0]).name if line else ""
+            is_rank = "frit.solver" in line and first.startswith("python")
+            if job not in spared and (is_rank if kind == "rank" else first.startswith("mpirun")):
+                pids.append(process.pid)
+    return pids
+
+
+def kill_one(kind: str, running: Service, random_: random.Random) -> str | None:
+    """Kill a victim of this kind, or of another where it is not there; which kind. None: nobody is there."""
     if kind == "service":
-        if running.process is None:
-            return False
         running.kill()
-        return True
-    if kind == "runner":
-        pids = runners(running.data)
-    else:
-        words = {"mpirun": "mpirun", "rank": "frit.solver"}
-        pids = []
-        for process in of_data(running.data):
-            with suppress(psutil.Error):
-                line = process.cmdline()
-                first = Path(line[0]).name if line else ""
-                is_rank = "frit.solver" in line and first.startswith("python")
-                if (kind == "rank" and is_rank) or (kind == "mpirun" and first.startswith(words["mpirun"])):
-                    pids.append(process.pid)
-    if not pids:
-        return False
-    with suppress(ProcessLookupError):
-        os.kill(random_.choice(pids), signal.SIGKILL)
-        return True
-    return False
+        return kind
+    spared = [job.id for job in jobs_of(running.data) if job.failures >= SPARED]
+    for other in [kind, *random_.sample(TREE, len(TREE))]:
+        pids = runners(running.data, spared) if other == "runner" else of_kind(other, running.data, spared)
+        if pids:
+            with suppress(ProcessLookupError):
+                os.kill(random_.choice(pids), signal.SIGKILL)
+                return other
+    return None
 
 
 def disturb(running: Service, kills: int, seconds: float, seed: int) -> Counter[str]:
-    """Kill `kills` times within about `seconds`, or until all jobs are done; a killed service is started again.
+    """Kill `kills` times, within about `seconds` if it can be; or until all jobs are done. A killed service is started
+    again.
 
-    Victims of all kinds come in turn, at random; one that is not there is waited for, and no work is done meanwhile.
+    Victims of all kinds come in turn, at random; where there is none, one is waited for, and no work is done meanwhile.
     """
     random_, counts = random.Random(seed), Counter[str]()
     began = time.monotonic()
     for moment in sorted(random_.uniform(0.0, seconds) for _ in range(kills)):
         time.sleep(max(0.0, began + moment - time.monotonic()))
         kind = random_.choice(VICTIMS)
-        while not kill_one(kind, running, random_):
+        while (killed := kill_one(kind, running, random_)) is None:
             if all_done(running.data):
                 return counts
-            time.sleep(0.02)
-        counts[kind] += 1
-        if kind == "service":
+            time.sleep(0.05)
+        counts[killed] += 1
+        if killed == "service":
             time.sleep(random_.uniform(0.0, seconds / kills))
             running.start()
     return counts
@@ -227,3 +236,46 @@ def run_undisturbed(data: Path, jobs: list[NewJob], seconds: float) -> float:
         began = time.monotonic()
         wait(data, seconds)
         return time.monotonic() - began
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a soak went: kills by kind, attempts of each job, seconds left alone and under fire."""
+
+    killed: Counter[str]
+    attempts: list[int]
+    calm: float
+    wild: float
+
+    def __str__(self) -> str:
+        kinds = ", ".join(f"{number} {kind}" for kind, number in sorted(self.killed.items()))
+        return (
+            f"{self.killed.total()} kills ({kinds}) over {len(self.attempts)} jobs: each succeeded once, after "
+            f"{min(self.attempts)} to {max(self.attempts)} attempts, {sum(self.attempts)} in all; "
+            f"{self.calm:.0f} s undisturbed, {self.wild:.0f} s under fire"
+        )
+
+
+def soak(folder: Path, count: int, kills: int, steps: int) -> Report:
+    """Run the same jobs calmly and under fire. Every job must succeed exactly once, with the history of the calm run,
+    and no process be left.
+
+    The kills fall within nine tenths of the time that the calm jobs took, on this machine: there is always a victim.
+    """
+    jobs = new_jobs(count, steps)
+    run_undisturbed(folder / "warm", new_jobs(1, 20), seconds=300.0)  # compiled, or read from disk
+    calm = run_undisturbed(folder / "calm", jobs, seconds=3600.0)
+    submit(folder / "wild", jobs)
+    with service(folder / "wild") as running:
+        began = time.monotonic()
+        killed = disturb(running, kills, 0.9 * calm, seed=7)
+        wait(folder / "wild", seconds=3600.0)
+        wild = time.monotonic() - began
+        assert not of_data(folder / "wild")
+        assert not runners(folder / "wild")
+    ended = jobs_of(folder / "wild")
+    assert Counter(job.state for job in ended) == {State.SUCCEEDED: count}, [job.message for job in ended]
+    assert set(successes(folder / "wild").values()) == {1}
+    assert histories(folder / "wild") == histories(folder / "calm")
+    assert killed.total() == kills, killed
+    return Report(killed, [job.attempt for job in ended], calm, wild)

@@ -289,7 +289,7 @@ def test_one_runner_per_run_directory_and_a_nursery_that_may_die(tmp_path: Path)
             directory = tmp_path / f"run{k}"
             directory.mkdir()
             (directory / "submitted.json").write_text(json.dumps({"name": "sleep 30"}))
-            orders.append(Order(1, str(directory), 1, (os.sched_getaffinity(0).pop(),), None, 5.0))
+            orders.append(Order(1, str(directory), 1, (os.sched_getaffinity(0).pop(),), None, 5.0, 10**10))
         pid = await backend.start(orders[0])
         with pytest.raises(BackendError, match="a runner is there already"):
             await backend.start(orders[0])

@@ -7,20 +7,41 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..files import boot, read_json, start_of, try_lock
 from ..jobs import Exit
-from ..runner import Order, read_exit
+from ..launch import kill_marked
+from ..runner import LOCK, Order, read_exit, run_mark
 
 LOOK_AGAIN = 0.05  # seconds between two looks at a runner whose process is not known yet
+LOOK_EVERY = 2.0  # seconds between two looks at the folder of a runner that lives
+LEAVING = 2.0  # seconds after which a process that has let go its lock has ended
+CLEARING = 5.0  # seconds for what was killed to be gone
+GONE = (FileNotFoundError, NotADirectoryError)
+
+
+class Process(NamedTuple):
+    """A process that no later one is taken for."""
+
+    pid: int
+    start: int
+    boot: str
 
 
 class BackendError(RuntimeError):
     """No runner was started; the message says why."""
+
+
+class FolderError(RuntimeError):
+    """The folder of a run is gone, or another stands in its place; a runner may still live."""
+
+    def __init__(self) -> None:
+        super().__init__("its run folder was deleted, moved away or replaced while it had cores")
 
 
 class LocalBackend:
@@ -33,9 +54,12 @@ class LocalBackend:
     async def start(self, order: Order) -> int:
         """The pid of a new runner, which holds the lock of its run directory from its first moment on.
 
-        Raises `BackendError`; then there is no runner.
+        Raises `BackendError`, `FolderError`; then there is no runner.
         """
-        lock = try_lock(Path(order.directory) / "runner.lock")
+        try:
+            lock = try_lock(Path(order.directory) / LOCK)
+        except GONE as error:
+            raise FolderError from error
         if lock is None:
             raise BackendError(f"{order.directory}: a runner is there already")
         try:
@@ -59,27 +83,55 @@ class LocalBackend:
         return int(answer)
 
     async def recorded(self, directory: Path, attempt: int) -> dict[str, Any] | None:
-        """Wait until the attempt's runner has recorded itself; the record, None where it ended before."""
+        """Wait until the attempt's runner has recorded itself; the record, None where it ended before.
+
+        Raises `FolderError`.
+        """
         while (record := read_json(directory / "attempt.json")).get("attempt") != attempt:
-            if (lock := try_lock(directory / "runner.lock")) is not None:
+            if (lock := lock_again(directory)) is not None:
                 os.close(lock)
                 return None
             await asyncio.sleep(LOOK_AGAIN)
         return record
 
-    async def ended(self, directory: Path, attempt: int, pid: int | None = None) -> Exit | None:
+    async def ended(
+        self, directory: Path, attempt: int, pid: int | None = None, seen: Callable[[], None] = lambda: None
+    ) -> Exit | None:
         """Wait for the end of the attempt's runner; its exit record, None where it left none.
 
-        pid: the process that `start` has just told of.
+        pid: the process that `start` has just told of; seen: called after every look at a runner that lives. Raises
+        `FolderError`, within seconds after the folder has gone.
         """
         process = None if pid is None else opened(pid)
-        while (lock := try_lock(directory / "runner.lock")) is None:  # it lives, and so the pid was not reused
-            await gone(process or runner_of(directory, attempt))
-            process = None
+        while (lock := lock_again(directory)) is None:  # it lives, and so the pid was not reused
+            seen()
+            if process is None:
+                process = runner_of(directory, attempt)
+            if process is not None:
+                process = await gone(process, LOOK_EVERY)
+            elif read_json(directory / "attempt.json").get("attempt") == attempt:
+                return read_exit(directory, attempt)  # it has ended, and somebody else holds the lock
+            else:
+                await asyncio.sleep(LOOK_AGAIN)
+        os.close(lock)
         if process is not None:
             os.close(process)
-        os.close(lock)
+        process = runner_of(directory, attempt)
+        if process is not None and (process := await gone(process, LEAVING)) is not None:
+            os.close(process)
+            raise FolderError  # this is a copy, in which nobody runs
         return read_exit(directory, attempt)
+
+    async def clear(self, directory: Path, runner: Process | None) -> None:
+        """Kill the runner, and all that runners have started in a folder that may be gone."""
+        if runner is not None and (process := opened_again(runner)) is not None:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process, signal.SIGKILL)
+            os.close(process)
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + CLEARING
+        while await asyncio.to_thread(kill_marked, run_mark(directory)) and loop.time() < deadline:
+            await asyncio.sleep(LOOK_AGAIN)
 
     def tell(self, directory: Path, attempt: int, number: signal.Signals) -> None:
         """Send the attempt's runner a signal, if it lives; a reused pid is never hit."""
@@ -112,11 +164,16 @@ def open_nursery() -> tuple[subprocess.Popen[bytes], socket.socket]:
 def runner_of(directory: Path, attempt: int) -> int | None:
     """A descriptor of the process that recorded itself as the runner of this attempt; None: it is not there (yet)."""
     record = read_json(directory / "attempt.json")
-    if record.get("attempt") != attempt or record.get("boot") != boot():
+    if record.get("attempt") != attempt:
         return None
-    if (process := opened(record["pid"])) is None:
+    return opened_again(Process(record["pid"], record["pid_start"], record["boot"]))
+
+
+def opened_again(runner: Process) -> int | None:
+    """A descriptor of a process that was seen before, if it lives; never of another that has its pid now."""
+    if runner.boot != boot() or (process := opened(runner.pid)) is None:
         return None
-    if start_of(record["pid"]) != record["pid_start"]:
+    if start_of(runner.pid) != runner.start:
         os.close(process)
         return None
     return process
@@ -130,14 +187,28 @@ def opened(pid: int) -> int | None:
         return None
 
 
-async def gone(process: int | None) -> None:
-    """Wait until a process has ended; a moment where it is not known."""
-    if process is None:
-        return await asyncio.sleep(LOOK_AGAIN)
+def lock_again(directory: Path) -> int | None:
+    """The lock of a directory in which a runner was started; see `try_lock`. Raises `FolderError`."""
+    try:
+        return try_lock(directory / LOCK, make=False)
+    except GONE as error:
+        raise FolderError from error
+
+
+async def gone(process: int, seconds: float) -> int | None:
+    """The process again, if it has not ended within that time."""
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
     loop.add_reader(process, ended.set)
     try:
-        await ended.wait()
-    finally:
+        async with asyncio.timeout(seconds):
+            await ended.wait()
+    except TimeoutError:
+        return process
+    except BaseException:
         loop.remove_reader(process)
         os.close(process)
+        raise
+    finally:
+        loop.remove_reader(process)
+    os.close(process)
+    return None

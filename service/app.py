@@ -335,7 +335,10 @@ async def show_limits(engine: TheEngine, who: Reader) -> views.Limits:
     s = engine.settings
     return views.Limits(
         cores=s.cores, ranks=s.cores, body_bytes=s.body_limit, points_per_sweep=s.points_limit,
-        nodes_per_case=s.nodes_limit, queued_jobs=s.queue_limit, page=filters.LARGEST_PAGE,
+        values_per_body=s.values_limit, nodes_per_case=s.nodes_limit, particles_per_case=s.particles_limit,
+        rows_per_case=s.rows_limit, snapshots_per_case=s.snapshots_limit, memory_per_rank_bytes=s.memory_limit,
+        disk_per_job_bytes=s.disk_limit, sweep_bytes=s.sweep_bytes_limit, queued_jobs=s.queue_limit,
+        page=filters.LARGEST_PAGE,
         states={str(state): sentence for state, sentence in SENTENCES.items()},
     )  # fmt: skip
 

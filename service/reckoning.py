@@ -1,8 +1,8 @@
 """What a case would take, reckoned before it is let in: nodes, particles, rows, snapshots, memory, disk.
 
 All of it follows from a few numbers of the resolved case; nothing is built. Memory and disk were measured: 1.4 to
-2.4 kB a node in 2-D, 5.1 to 11.4 kB in 3-D, 0.27 GB a rank besides; checkpoints 140 to 530 bytes a node, snapshots up to
-30, rows 230 bytes and 19 a particle. A run that takes more than it should is ended by its runner.
+2.4 kB a node in 2-D, 5.1 to 11.4 kB in 3-D, 0.27 GB a rank besides; checkpoints 140 to 530 bytes a node, snapshots up
+to 30, rows 230 bytes and 19 a particle. A run that takes more than it should is ended by its runner.
 """
 
 import math

@@ -209,7 +209,14 @@ class Limits(BaseModel):
     ranks: int
     body_bytes: int
     points_per_sweep: int
+    values_per_body: int
     nodes_per_case: int
+    particles_per_case: int
+    rows_per_case: int
+    snapshots_per_case: int
+    memory_per_rank_bytes: int
+    disk_per_job_bytes: int
+    sweep_bytes: int
     queued_jobs: int
     page: int
     states: dict[str, str]

@@ -18,7 +18,7 @@ import zarr
 from asking import LONG, PACKING, TINY, Tree, final, listening, service, until
 from fastapi.testclient import TestClient
 
-from frit.service.admission import estimated_nodes
+from frit.service.reckoning import estimated_nodes
 from frit.solver.case import parse_case
 from frit.solver.geometry import lattice
 

@@ -7,9 +7,9 @@ the others.
 
 import asyncio
 import json
-import re
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -28,23 +28,24 @@ ARRIVAL = 60.0  # seconds in which a body must come
 PIECE = 1 << 18  # bytes measured at a time
 DEPTH = 24  # of objects and lists within each other, several times what a case or sweep has
 KEYS = 1000  # of an object
-QUOTE, BACKSLASH, COMMA = b'"\\,'
+ALL_KEYS = 20_000  # of all objects of a body
+QUOTE, BACKSLASH, COMMA, COLON = b'"\\,:'
 DEEPER = (str, list, dict)  # types of values that may hold text
 DECODER = json.JSONDecoder()  # NaN and Infinity come through: the field that has them is named later
-NOT_LATER = re.compile(r"^/files/[^/]+/content$")  # the one string that is never shown
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Of a JSON text: values, counted by what stands before them, and objects and lists within each other."""
+    """Of a JSON text: values, counted by what stands before them; keys; objects and lists within each other."""
 
     values: int
+    keys: int
     depth: int
 
 
 def measure(body: bytes) -> Size:
     """The size of a JSON text; of anything else, nothing sensible."""
-    values, level, deepest, inside, slashes = 1, 0, 0, 0, 0
+    values, keys, level, deepest, inside, slashes = 1, 0, 0, 0, 0, 0
     for start in range(0, len(body), PIECE):
         text = np.frombuffer(body, np.uint8, min(PIECE, len(body) - start), start)
         places = np.arange(len(text), dtype=np.int32)
@@ -57,9 +58,10 @@ def measure(body: bytes) -> Size:
         opening = (text == ord("[")) | (text == ord("{"))
         levels = level + np.cumsum(opening.astype(np.int32) - ((text == ord("]")) | (text == ord("}"))))
         values += int(np.count_nonzero(opening) + np.count_nonzero(text == COMMA))
+        keys += int(np.count_nonzero(text == COLON))
         deepest = max(deepest, int(levels.max()))
         level, inside, slashes = int(levels[-1]), int(within[-1]), int(run[-1])
-    return Size(values, deepest)
+    return Size(values, keys, deepest)
 
 
 def parsed(body: bytes, most: int) -> Any:
@@ -70,6 +72,8 @@ def parsed(body: bytes, most: int) -> Any:
     size = measure(body)
     if size.values > most:
         raise _too_much("", f"has {size.values} values, must be at most {most}: upload lists of particles as a file")
+    if size.keys > ALL_KEYS:
+        raise _too_much("", f"has {size.keys} keys in all objects together, must be at most {ALL_KEYS}")
     if size.depth > DEPTH:
         raise _too_much("", f"is nested {size.depth} deep, must be at most {DEPTH}")
     try:
@@ -80,35 +84,42 @@ def parsed(body: bytes, most: int) -> Any:
         raise _not_json(f"not valid JSON: byte {error.start} is not UTF-8", 400) from None
     except (ValueError, RecursionError) as error:  # a number of too many digits
         raise _not_json(f"not valid JSON: {str(error)[:100]}") from None
-    wrong = []
-    for field in unshowable(tree):
-        wrong.append(field)
-        if len(wrong) == MOST_ERRORS:
-            break
-    if wrong:
+    if isinstance(tree, DEEPER) and (wrong := [*islice(unshowable(tree), MOST_ERRORS)]):
         raise refused("refused-request", "The request is refused", wrong)
     return tree
 
 
 def unshowable(tree: Any) -> Iterator[WrongField]:
     """Objects of too many keys, and strings with characters that a terminal would obey; not the contents of files."""
-    waiting = [("", tree)]
-    while waiting:
-        place, value = waiting.pop()
-        if isinstance(value, str):
-            if UNSHOWABLE.search(value) and not NOT_LATER.match(place):
-                yield WrongField(pointer=place, value=shown(ascii(value)), detail="must have no control characters")
-        elif isinstance(value, list):
-            waiting.extend((f"{place}/{n}", item) for n, item in enumerate(value) if isinstance(item, DEEPER))
-        elif isinstance(value, dict):
-            if len(value) > KEYS:
-                yield WrongField(pointer=place, detail=f"has {len(value)} keys, must be at most {KEYS}")
-                continue
-            for key, item in value.items():
-                if UNSHOWABLE.search(key):
-                    yield WrongField(pointer=place, value=shown(ascii(key)), detail="a key has control characters")
-                elif isinstance(item, DEEPER):
-                    waiting.append((f"{place}/{escaped(key)}", item))
+    yield from _unshowable(tree, ())
+
+
+def _unshowable(value: Any, path: tuple[str | int, ...]) -> Iterator[WrongField]:
+    if isinstance(value, str):
+        if UNSHOWABLE.search(value) and not is_content(path):
+            wrong = shown(ascii(value))
+            yield WrongField(pointer=_pointer(path), value=wrong, detail="must have no control characters")
+    elif isinstance(value, list):
+        for number, item in enumerate(value):
+            if isinstance(item, DEEPER):
+                yield from _unshowable(item, (*path, number))
+    elif len(value) > KEYS:
+        yield WrongField(pointer=_pointer(path), detail=f"has {len(value)} keys, must be at most {KEYS}")
+    else:
+        for key, item in value.items():
+            if UNSHOWABLE.search(key):
+                yield WrongField(pointer=_pointer(path), value=shown(ascii(key)), detail="a key has control characters")
+            elif isinstance(item, DEEPER):
+                yield from _unshowable(item, (*path, key))
+
+
+def is_content(path: tuple[str | int, ...]) -> bool:
+    """Whether it is the content of an uploaded file: the one string that is never shown."""
+    return len(path) == 3 and path[0] == "files" and path[2] == "content"
+
+
+def _pointer(path: tuple[str | int, ...]) -> str:
+    return "".join(f"/{escaped(str(part))}" for part in path)
 
 
 def _too_much(pointer: str, detail: str) -> HttpError:

@@ -1,6 +1,7 @@
 """`frit serve`, and the commands that speak to a service: submit, jobs, show, log, cancel, retry, compare."""
 
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 Url = Annotated[str, typer.Option("--url", envvar="FRIT_URL", metavar="URL", help="Address of the service.")]
 Secret = Annotated[str | None, typer.Option("--token", envvar="FRIT_TOKEN", help="Access token of the service.")]
 JobId = Annotated[str, typer.Argument(metavar="ID", help="Of the job, or the beginning of it.")]
+SWITCH = 5e-4  # seconds that a thread which checks a large case keeps the event loop waiting at a time
 HERE = "http://127.0.0.1:8000"
 CURVES = (".png", ".pdf", ".svg")
 
@@ -65,6 +67,7 @@ def serve(
     typer.echo(f"frit serves {settings.data.absolute()} with {settings.cores} cores", err=True)
     if warning is not None:
         typer.echo(warning, err=True)
+    sys.setswitchinterval(SWITCH)
     uvicorn.run(create_app(settings), host=host, port=port, access_log=access_log, **options(settings))
 
 

@@ -54,7 +54,7 @@ class Settings(BaseSettings):
     """connections at once, at most, those that follow events among them"""
     body_limit: AtLeastOne = 20_000_000
     """bytes of a request's body, at most"""
-    values_limit: AtLeastOne = 500_000
+    values_limit: AtLeastOne = 300_000
     """values of a request's JSON, at most; the content of a file is one"""
     points_limit: AtLeastOne = 100_000
     """points of a sweep, at most"""

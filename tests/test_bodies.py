@@ -48,12 +48,14 @@ leaves = st.none() | st.booleans() | st.integers() | st.text(alphabet='ab"\\,[]{
 trees = st.recursive(leaves, lambda inner: st.lists(inner) | st.dictionaries(st.text('k"\\,['), inner), max_leaves=40)
 
 
-def plainly(tree: Any) -> tuple[int, int]:
-    """Commas and brackets outside of strings, plus one; brackets within each other."""
+def plainly(tree: Any) -> tuple[int, int, int]:
+    """Commas and brackets outside of strings; keys; brackets within each other."""
     if not isinstance(tree, list | dict):
-        return 0, 0
+        return 0, 0, 0
     found = [plainly(inner) for inner in (tree.values() if isinstance(tree, dict) else tree)]
-    return 1 + max(len(tree) - 1, 0) + sum(v for v, _ in found), 1 + max((d for _, d in found), default=0)
+    values = 1 + max(len(tree) - 1, 0) + sum(v for v, _, _ in found)
+    keys = (len(tree) if isinstance(tree, dict) else 0) + sum(k for _, k, _ in found)
+    return values, keys, 1 + max((d for _, _, d in found), default=0)
 
 
 @given(trees, st.sampled_from([7, 8, 64, 1 << 18]), st.booleans())
@@ -64,8 +66,8 @@ def test_the_measure_is_that_of_the_tree(tree: Any, piece: int, ascii_: bool) ->
         size = measure(json.dumps(tree, ensure_ascii=ascii_).encode())
     finally:
         bodies.PIECE = before
-    values, depth = plainly(tree)
-    assert (size.values, size.depth) == (values + 1, depth)
+    values, keys, depth = plainly(tree)
+    assert (size.values, size.keys, size.depth) == (values + 1, keys, depth)
 
 
 @pytest.mark.parametrize("body", [b"", b"]]]]", b'"', b"\\\\\\", b'"' * 1001, bytes(range(256))])
@@ -83,6 +85,7 @@ def test_what_is_no_json_is_measured_all_the_same(body: bytes) -> None:
         b'{"case":' * 5000 + b"1" + b"}" * 5000,
         b"[" + b"{}," * 300_000 + b"{}]",
         b'{"case": [' + b"1," * 30_000 + b"1]}",
+        b'{"case": [' + b'{"a":1,"b":"c:d"},' * 7000 + b'{"c":1,"d":1,"e":1}]}',
         b'{"case": {"particles": {"radii": [' + b'"x",' * 30_000 + b"1]}}}",
     ],
 )
@@ -199,6 +202,8 @@ def unshowable_in(text: str) -> list[Any]:
 def test_the_content_of_a_file_may_have_lines() -> None:
     tree = {"files": {"a.csv": {"content": "x\ny\x1b"}}, "case": {"files": {"a": {"content": "x\n"}}}}
     assert [field.pointer for field in unshowable(tree)] == ["/case/files/a/content"]
+    listed = {"files": {"a/b": {"content": ["x\n"]}}}
+    assert [field.pointer for field in unshowable(listed)] == ["/files/a~1b/content/0"]
 
 
 def test_what_older_jobs_have_is_written_out() -> None:

@@ -7,11 +7,17 @@ content of every solver file that holds compiled code: an edit to any of them op
 numba needs a folder it can write into, for what it finds compiled for another processor or not at all. An installation
 that only reads its own files (an image) therefore brings compiled code along in `FRIT_CACHE_SEED`, and the first start
 copies it.
+
+numba runs what it finds in the cache, so the folder must be the user's own, or root's, and nobody else's to write into.
+One that is not is left alone, and all is compiled into a folder that lasts as long as the process.
 """
 
+import atexit
 import hashlib
 import os
 import shutil
+import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -45,10 +51,34 @@ def cache_folder() -> Path:
     return cache_root() / digest.hexdigest()[:16]
 
 
+def is_trusted(folder: Path) -> bool:
+    """Whether it is a folder of this user or of root in which nobody else may write."""
+    try:
+        status = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(status.st_mode) and status.st_uid in (0, os.geteuid()) and not status.st_mode & 0o022
+
+
+def trusted_folder() -> Path:
+    """The folder of the compiled code, made where it is not there; one for this process if it is not to be trusted."""
+    folder = cache_folder()
+    with suppress(OSError):  # it cannot be made: numba finds none, and compiles
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        seed(folder)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if not (is_trusted(folder) and is_trusted(folder.parent)):
+            own = tempfile.mkdtemp(prefix="frit-compiled-")
+            atexit.register(shutil.rmtree, own, ignore_errors=True)
+            print(f"{folder}: others may write there, so its compiled code is not used", file=sys.stderr, flush=True)
+            return Path(own)
+    return folder
+
+
 def seed(folder: Path) -> None:
     """Make a cache folder that is not there from the one of its name in `FRIT_CACHE_SEED`, whole or not at all."""
     source = Path(os.environ.get("FRIT_CACHE_SEED", os.devnull)) / folder.name
-    if folder.exists() or not source.is_dir():
+    if folder.exists() or not is_trusted(source):
         return
     with suppress(OSError):  # another process was quicker; or no room, and then all is compiled or numba complains
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -58,8 +88,7 @@ def seed(folder: Path) -> None:
             copy.rename(folder)
 
 
-seed(cache_folder())
-numba.config.CACHE_DIR = str(cache_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
+numba.config.CACHE_DIR = str(trusted_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 OPTIONS: dict[str, Any] = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}

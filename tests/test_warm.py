@@ -53,6 +53,61 @@ def test_a_cache_that_cannot_be_written_is_no_error_yet(tmp_path: Path) -> None:
     jit.seed(tmp_path / "cache" / "hash")
 
 
+ASK = "import numba; from frit.solver import jit; print(jit.cache_folder(), numba.config.CACHE_DIR)"
+
+
+def chosen(root: Path) -> tuple[Path, Path, str]:
+    """The cache folder by its name, the one that numba is given, and what is said on stderr."""
+    environment, command = {**os.environ, "FRIT_CACHE_DIR": str(root)}, [sys.executable, "-P", "-c", ASK]
+    asked = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    named, given = map(Path, asked.stdout.split())
+    return named, given, asked.stderr
+
+
+def test_a_cache_is_made_for_its_user_alone(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        named, given, said = chosen(tmp_path / "deep" / "cache")
+    finally:
+        os.umask(before)
+    assert (named, said) == (given, "")
+    assert {folder.stat().st_mode & 0o777 for folder in (named, named.parent)} == {0o700}
+    assert chosen(tmp_path / "deep" / "cache")[1] == named
+
+
+@pytest.mark.parametrize("which", ["folder", "parent", "link", "file"])
+def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path, which: str) -> None:
+    """numba would run whatever they have put there."""
+    named, _, _ = chosen(tmp_path / "cache")
+    if which in ("folder", "parent"):
+        (named if which == "folder" else named.parent).chmod(0o777)
+    else:
+        named.rmdir()
+        if which == "link":
+            (tmp_path / "elsewhere").mkdir()
+            named.symlink_to(tmp_path / "elsewhere")
+        else:
+            named.touch()
+    _, given, said = chosen(tmp_path / "cache")
+    if which != "file":
+        assert "others may write there" in said
+        assert given != named
+        assert not given.exists(), "it lasts as long as the process"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give folders away")
+def test_a_cache_of_another_user_is_not_used(tmp_path: Path) -> None:
+    named, _, _ = chosen(tmp_path / "cache")
+    os.chown(named, 12345, 12345)
+    assert chosen(tmp_path / "cache")[1] != named
+
+
+def test_a_seed_that_others_may_write_is_not_taken(brought: Path, tmp_path: Path) -> None:
+    (brought / "hash").chmod(0o777)
+    jit.seed(tmp_path / "cache" / "hash")
+    assert not (tmp_path / "cache").exists()
+
+
 def test_the_cases_of_the_warm_up_are_accepted() -> None:
     assert [parse_case(tree).name for tree in warm.CASES] == [tree["name"] for tree in warm.CASES]
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import csv
+import gc
 import hashlib
 import io
 import json
@@ -37,6 +38,8 @@ def create_app(settings: Settings) -> FastAPI:
         async with Engine(settings) as engine:
             app.state.engine, app.state.settings = engine, settings
             app.state.large_bodies = asyncio.Semaphore(AT_ONCE)
+            gc.collect()
+            gc.freeze()  # what is there now stays: a collection of what requests leave need not look through it
             app.state.queue = admission.QueueLimit(engine.store, settings.queue_limit)
             yield
             if settings.release:

@@ -51,6 +51,7 @@ def serve(
 
     from .app import create_app
     from .engine import EngineError, check
+    from .memory import keep_little
     from .security import AddressError
     from .settings import Settings
     from .wire import options
@@ -68,6 +69,7 @@ def serve(
     if warning is not None:
         typer.echo(warning, err=True)
     sys.setswitchinterval(SWITCH)
+    keep_little()
     uvicorn.run(create_app(settings), host=host, port=port, access_log=access_log, **options(settings))
 
 

@@ -1,5 +1,6 @@
 """Memory: how much of the machine belongs to a core, and how much a process and all below it take."""
 
+import ctypes
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -8,6 +9,7 @@ import psutil
 
 LEAST = 500_000_000  # bytes; an idle rank takes half of that
 MOUNTS = Path("/sys/fs/cgroup")
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8  # of glibc's mallopt
 LIMITS = {"": "memory.max", "memory": "memory.limit_in_bytes"}  # by the controllers of a line in /proc/self/cgroup
 
 
@@ -47,3 +49,10 @@ def _sum(tree: list[psutil.Process], shared_once: bool) -> int:
             info = process.memory_full_info() if shared_once else process.memory_info()
             total += info.pss if shared_once else info.rss
     return total
+
+
+def keep_little() -> None:
+    """Have large blocks, and what threads have used, go back to the machine when they are free; with glibc."""
+    with suppress(AttributeError):
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, 1 << 20)
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)

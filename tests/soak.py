@@ -22,6 +22,7 @@ import psutil
 
 from frit.service.files import read_json, start_of
 from frit.service.jobs import Job, NewJob, State
+from frit.service.runner import advanced
 from frit.service.store import Store
 from frit.solver.case import parse_case
 
@@ -36,7 +37,7 @@ from frit.service.engine import Engine
 from frit.service.settings import Settings
 
 async def main():
-    async with Engine(Settings(data=sys.argv[1], cores=4, backoff=0.05, backoff_limit=0.2, poll=0.2)):
+    async with Engine(Settings(data=sys.argv[1], cores=2, backoff=0.05, backoff_limit=0.2, poll=0.2)):
         await asyncio.Event().wait()
 
 asyncio.run(main())
@@ -148,7 +149,7 @@ def kill_one(kind: str, running: Service, random_: random.Random) -> str | None:
     if kind == "service":
         running.kill()
         return kind
-    spared = [job.id for job in jobs_of(running.data) if job.failures >= SPARED]
+    spared = [job.id for job in jobs_of(running.data) if is_spared(job, running.data / "runs" / job.id)]
     for other in [kind, *random_.sample(TREE, len(TREE))]:
         pids = runners(running.data, spared) if other == "runner" else of_kind(other, running.data, spared)
         if pids:
@@ -156,6 +157,11 @@ def kill_one(kind: str, running: Service, random_: random.Random) -> str | None:
                 os.kill(random_.choice(pids), signal.SIGKILL)
                 return other
     return None
+
+
+def is_spared(job: Job, directory: Path) -> bool:
+    """Whether it has broken too often in a row, and has got no further in its present attempt either."""
+    return job.failures >= SPARED and not advanced(directory, job.attempt)
 
 
 def disturb(running: Service, kills: int, seconds: float, seed: int) -> Counter[str]:

@@ -12,6 +12,6 @@ def test_a_few_kills(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_three_hundred_kills_over_thirty_jobs(tmp_path: Path) -> None:
-    report = soak(tmp_path, count=30, kills=300, steps=6000)
+    report = soak(tmp_path, count=30, kills=300, steps=3000)
     assert set(report.killed) == set(VICTIMS)
     print(report)

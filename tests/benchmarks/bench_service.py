@@ -244,7 +244,7 @@ def restart(queued: int = 10_000) -> None:
 def long_soak() -> None:
     """A thousand kills, as test_soak.py has three hundred; an error where it does not go well. Not among all."""
     with tempfile.TemporaryDirectory() as folder:
-        print(soak(Path(folder), count=100, kills=1000, steps=6000))
+        print(soak(Path(folder), count=100, kills=1000, steps=3000))
 
 
 BENCHES: dict[str, Callable[[], None]] = {

@@ -170,10 +170,11 @@ class Uploads:
     def hide(self, error: CaseError) -> CaseError:
         """The error in the request's own names."""
         names = {path: name for name, path in self.paths.items()}
-        return CaseError(
+        shown = (
             Problem(p.key, names.get(p.value, p.value) if isinstance(p.value, str) else p.value, p.allowed)
             for p in error.problems
         )
+        return CaseError(shown, error.more)
 
 
 def with_uploads(

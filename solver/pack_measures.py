@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from . import overlaps
 from .arrays import Flags, Floats, Integers
 
 TOUCH = 1e-3  # of the mean radius: particles nearer than this touch
@@ -139,22 +139,17 @@ def touching(x: Floats, r: Floats, low: Floats, high: Floats) -> Touching:
 
 
 def near_pairs(x: Floats, r: Floats, tolerance: float) -> tuple[Integers, Floats]:
-    """Pairs (p, 2), and their gaps (p,), of particles whose surfaces are nearer than the tolerance.
-
-    Each particle looks as far as its own radius and the largest; a pair is found once.
-    """
-    tree, largest = cKDTree(x), float(r.max())
-    if len(r) < 2 or largest < 1.5 * float(np.median(r)):
-        pairs = tree.query_pairs(2.0 * largest + tolerance, output_type="ndarray").astype(np.int64)
-    else:
-        found = tree.query_ball_point(x, r + largest + tolerance)
-        i = np.repeat(np.arange(len(r)), [len(near) for near in found])
-        j = np.concatenate([np.asarray(near, dtype=np.int64) for near in found])
-        pairs = np.stack([i, j], axis=1)[i < j]
-    gaps = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) - r[pairs].sum(axis=1)
-    kept = gaps < tolerance
-    order = np.lexsort(pairs[kept].T[::-1])
-    return pairs[kept][order], gaps[kept][order]
+    """Pairs (p, 2), and their gaps (p,), of particles whose surfaces are nearer than the tolerance."""
+    half = np.repeat((r + 0.5 * tolerance)[:, None], x.shape[1], axis=1)
+    kept, gaps = [np.empty((0, 2), dtype=np.int64)], [np.empty(0)]
+    for i, j in overlaps.near_pairs(x, half):
+        gap = np.linalg.norm(x[i] - x[j], axis=1) - (r[i] + r[j])
+        near = gap < tolerance
+        kept.append(np.stack([i[near], j[near]], axis=1))
+        gaps.append(gap[near])
+    pairs, gap = np.concatenate(kept), np.concatenate(gaps)
+    order = np.lexsort(pairs.T[::-1])
+    return pairs[order], gap[order]
 
 
 def density_profile(

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
-from frit.solver.case import CaseError, Place, Problem, case_schema, problems, read_tree, unknown_part
+from frit.solver.case import CaseError, Place, Problem, case_schema, read_tree, refusal, unknown_part
 
 FREE = ("name", "output.checkpoint_every")  # keys that change no result: axes along them would repeat one case
 
@@ -254,7 +254,7 @@ def parse_sweep(tree: Mapping[str, Any], base: Path | None = None) -> Sweep:
     try:
         return Sweep.model_validate(_found(tree, base))
     except ValidationError as error:
-        raise CaseError(problems(error, _part)) from None
+        raise refusal(error, _part) from None
 
 
 def _found(tree: object, base: Path | None) -> object:

@@ -226,3 +226,16 @@ def mean_in_box(field: Callable[[Floats], Floats], low: Floats, high: Floats, po
     for _ in axes:
         values = np.tensordot(values, 0.5 * weight, axes=(0, 0))
     return float(values)
+
+
+# --- boxes
+
+
+def meeting(x: Floats, half: Floats) -> set[tuple[int, int]]:
+    """All pairs i < j of boxes x +- half, both (n, dim), that have common points."""
+    return {
+        (i, j)
+        for j in range(len(x))
+        for i in range(j)
+        if all(abs(a - b) <= p + q for a, b, p, q in zip(x[i], x[j], half[i], half[j], strict=True))
+    }

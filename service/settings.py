@@ -1,6 +1,7 @@
 """Settings of the service: from the environment (FRIT_...) and the command line, complete and checked at birth."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,14 @@ Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 def own_cores() -> tuple[int, ...]:
     """The processors that this process may use."""
     return tuple(sorted(os.sched_getaffinity(0)))
+
+
+def whole_memory() -> int:
+    """Bytes of memory of this machine, or of the group of processes that this one is in, if that is less."""
+    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError):
+        pages = min(pages, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return pages
 
 
 class Settings(BaseSettings):
@@ -53,6 +62,26 @@ class Settings(BaseSettings):
     """nodes of a case, at most"""
     queue_limit: AtLeastOne = 200_000
     """jobs waiting in the queue, at most"""
+    particles_limit: AtLeastOne = 50_000
+    """particles of a case, at most; of a packing, as many as are reckoned before it is drawn"""
+    rows_limit: AtLeastOne = 1_000_000
+    """history rows of a case, at most"""
+    snapshots_limit: AtLeastOne = 10_000
+    """snapshots of a case, at most"""
+    memory_limit: AtLeastOne = Field(default_factory=lambda: whole_memory() // (os.cpu_count() or 1))
+    """bytes of memory for each core of a job; default: the machine's, divided by its cores"""
+    disk_limit: AtLeastOne = 100_000_000_000
+    """bytes that the results of a case take on disk, at most"""
+    sweep_limit: AtLeastOne = 300_000_000
+    """bytes of all resolved cases of a sweep together, at most"""
+    upload_memory: AtLeastOne = 2_000_000_000
+    """bytes of memory for reading the meshes of a request, at most"""
+    upload_seconds: Seconds = 30.0
+    """seconds for reading the meshes of a request, at most, by the clock and of the processor"""
+    upload_bytes: AtLeastOne = 500_000_000
+    """bytes of a mesh once it is converted, at most"""
+    conversions: AtLeastOne = 2
+    """requests whose files are read at the same time"""
 
     @property
     def runs(self) -> Path:

@@ -207,6 +207,12 @@ class Limits(BaseModel):
     body_bytes: int
     points_per_sweep: int
     nodes_per_case: int
+    particles_per_case: int
+    rows_per_case: int
+    snapshots_per_case: int
+    memory_bytes_per_core: int
+    disk_bytes_per_case: int
+    bytes_per_sweep: int
     queued_jobs: int
     page: int
     states: dict[str, str]

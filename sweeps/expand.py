@@ -2,6 +2,7 @@
 
 import gc
 import json
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -64,10 +65,13 @@ def count(sweep: Sweep) -> int:
     return (sweep.sample.points or chosen) * sweep.sample.replicates
 
 
-def expand(sweep: Sweep, limit: int | None = None) -> Expansion:
-    """All points. Raises `CaseError` for more than `limit` points, before any is made, and for impossible cases."""
+def expand(sweep: Sweep, limit: int | None = None, room: int | None = None) -> Expansion:
+    """All points. Raises `CaseError` for more than `limit` points, before any is made, and for impossible cases.
+
+    room: bytes of all resolved cases together, at most.
+    """
     with _no_collections():
-        return _expand(sweep, limit)
+        return _expand(sweep, limit, math.inf if room is None else room)
 
 
 @contextmanager
@@ -82,7 +86,7 @@ def _no_collections() -> Iterator[None]:
             gc.enable()
 
 
-def _expand(sweep: Sweep, limit: int | None) -> Expansion:
+def _expand(sweep: Sweep, limit: int | None, room: float) -> Expansion:
     if limit is not None and (n := count(sweep)) > limit:
         raise CaseError([Problem("axes", None, f"give {n} points, must be at most {limit}")])
     with np.errstate(all="ignore"):  # what overflows is refused with its case
@@ -90,12 +94,12 @@ def _expand(sweep: Sweep, limit: int | None) -> Expansion:
     points: dict[str, Point] = {}
     refused: dict[tuple[str, str], Problem] = {}
     variations, trees = Variations(), _Trees(sweep.base, columns)
-    duplicates = bad = 0
+    duplicates = bad = more = 0
     for number, picks in enumerate(rows, start=1):
         try:
             case = variations.case(trees.tree(picks))
         except CaseError as error:
-            bad += 1
+            bad, more = bad + 1, more + error.more
             for problem in error.problems:
                 refused.setdefault((problem.key, str(problem)), _at(problem, number, columns, picks))
             if bad == MOST_REFUSED:
@@ -109,9 +113,12 @@ def _expand(sweep: Sweep, limit: int | None) -> Expansion:
         parameters = {column.key: column.shown[pick] for column, pick in zip(columns, picks, strict=True)}
         if sweep.sample.replicates > 1 and case.particles.seed is not None:
             parameters[SEED] = case.particles.seed  # the first one's may be a default
-        points[hashed] = Point(hashed, case_text(name, texts), name, parameters)
+        text = case_text(name, texts)
+        if (room := room - len(text)) < 0:
+            raise CaseError([Problem("axes", None, f"give cases that are too large together, up to point {number}")])
+        points[hashed] = Point(hashed, text, name, parameters)
     if refused:
-        raise CaseError(refused.values())
+        raise CaseError(refused.values(), more)
     return Expansion(tuple(points.values()), duplicates)
 
 

@@ -1,14 +1,10 @@
 """What may come in: uploaded files, paths that name them, and sizes that this service can bear."""
 
-import base64
-import binascii
-import hashlib
 import json
 import math
 import os
-import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -20,31 +16,35 @@ from frit.sweeps.definition import parse_sweep
 from frit.sweeps.expand import expand
 
 from .jobs import NewJob, State
-from .problems import HttpError, WrongField, escaped, refused, refused_case, shown
-from .reckoning import too_much
+from .problems import HttpError, WrongField, escaped, pointer_to, refused, refused_case, shown
+from .reckoning import Excess, excesses, too_long
 from .settings import Settings
 from .store import NewPoint, Store
+from .uploads import Uploads
 from .views import FileContent, JobSubmission, SweepSubmission
 
-SUFFIXES = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".med", ".su2", ".csv")  # formats that refer to no other file
+NONE = Uploads()
 QUEUE_COUNT = 1.0  # seconds for which a count of the queue holds
 DEPTH = 6  # of tables in a case or sweep, more than there are
 Tree = dict[str, Any]
 
 
-def job_of(submission: JobSubmission, settings: Settings) -> NewJob:
-    """The job that a request asks for. Raises `HttpError`."""
+def job_of(submission: JobSubmission, settings: Settings, uploads: Uploads = NONE) -> NewJob:
+    """The job that a request asks for, with its files where they are kept. Raises `HttpError`."""
     check_ranks(submission.ranks, settings, "/ranks")
-    tree, uploads = with_uploads(submission.case, submission.files, settings, "/case")
+    check_paths(submission.case, submission.files, "/case")
+    refuse_excesses(too_long(submission.case.get("particles"), settings), "/case")
+    tree = _replaced(submission.case, uploads.paths) if uploads.paths else dict(submission.case)
     try:
         case = checked(tree)
     except CaseError as error:
         raise refused_case(uploads.hide(error), "/case") from None
-    if wrong := [one.field("/case") for one in too_much(case.tree(), submission.ranks, settings)]:
-        raise over_limit(*wrong)
+    check_mesh(case.nodes.path, settings, "/case/nodes/path")
     texts = {name: texts_of(table) for name, table in case.tables().items()}
+    text = case_text(case.name, texts)
+    refuse_excesses(excesses(json.loads(text), submission.ranks, settings), "/case")
     return NewJob(
-        case=case_text(case.name, texts), identity=identity(texts), ranks=submission.ranks,
+        case=text, identity=identity(texts), ranks=submission.ranks,
         priority=submission.priority, tags=tuple(submission.tags), time_limit=submission.time_limit,
         name=case.name if submission.name is None else submission.name,
     )  # fmt: skip
@@ -81,14 +81,16 @@ class NewSweep:
     duplicates: int
 
 
-def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
+def sweep_of(submission: SweepSubmission, settings: Settings, uploads: Uploads = NONE) -> NewSweep:
     """The sweep that a request asks for, with all its points. Takes seconds for many. Raises `HttpError`."""
+    check_paths(submission.definition, submission.files, "/definition")
+    refuse_excesses(_long_lists(submission.definition, settings), "/definition")
     given = submission.model_dump(include={"ranks", "name", "priority", "tags"}, exclude_none=True)
-    tree, uploads = with_uploads({**submission.definition, **given}, submission.files, settings, "/definition")
+    tree = {**submission.definition, **given}
     try:
-        sweep = parse_sweep(tree)
+        sweep = parse_sweep(_replaced(tree, uploads.paths) if uploads.paths else tree)
         check_ranks(sweep.ranks, settings, "/definition/ranks" if submission.ranks is None else "/ranks")
-        expansion = expand(sweep, settings.points_limit, settings.sweep_bytes_limit)
+        expansion = expand(sweep, settings.points_limit, settings.sweep_limit)
     except CaseError as error:
         raise refused_case(uploads.hide(error), "/definition", "The sweep is refused") from None
     except RecursionError:
@@ -96,15 +98,23 @@ def sweep_of(submission: SweepSubmission, settings: Settings) -> NewSweep:
         raise refused_case(deep, "/definition", "The sweep is refused") from None
     points = []
     for point in expansion.points:
-        wrong = too_much(json.loads(point.case), sweep.ranks, settings)
-        if (first := next(wrong, None)) is not None:
-            raise over_limit(first.field("/definition/base", f" ({point.name})"))
+        case = json.loads(point.case)
+        check_mesh(case["nodes"].get("path"), settings, "/definition")
+        refuse_excesses(excesses(case, sweep.ranks, settings), "/definition", point.name)
         job = NewJob(
             case=point.case, identity=point.identity, name=point.name, ranks=sweep.ranks, priority=sweep.priority,
             tags=tuple(sweep.tags), time_limit=submission.time_limit,
         )  # fmt: skip
         points.append(NewPoint(job, point.parameters))
     return NewSweep(sweep.name, sweep.resolved_json(), points, expansion.duplicates)
+
+
+def _long_lists(definition: Mapping[str, Any], settings: Settings) -> Iterator[Excess]:
+    base, axes = definition.get("base"), definition.get("axes")
+    if isinstance(base, Mapping):
+        yield from too_long(base.get("particles"), settings, "base.particles")
+    if isinstance(axes, Mapping):
+        yield from too_long(axes.get("particles"), settings, "axes.particles")
 
 
 # --- limits -----------------------------------------------------------------------------------------------
@@ -115,6 +125,25 @@ def check_ranks(ranks: int, settings: Settings, pointer: str) -> None:
     if ranks > settings.cores:
         allowed = f"must be at most {settings.cores}, the cores there are"
         raise over_limit(WrongField(pointer=pointer, value=ranks, detail=allowed))
+
+
+def refuse_excesses(found: Iterable[Excess], pointer: str, point: str | None = None) -> None:
+    """Raises `HttpError` where there are any. Of a point of a sweep words tell the key: an axis may have set it."""
+    wrong = []
+    for excess in found:
+        place, words = pointer + pointer_to(excess.key), excess.allowed
+        if point is not None:
+            place, words = pointer, f"{excess.key} {words} ({point})"
+        wrong.append(WrongField(pointer=place, value=shown(excess.value), detail=words))
+    if wrong:
+        raise over_limit(*wrong)
+
+
+def check_mesh(path: str | None, settings: Settings, pointer: str) -> None:
+    """No case of a request names a file that did not come with one, whatever looked at its paths before."""
+    folder = settings.data.absolute() / "files"
+    if path is not None and Path(os.path.realpath(path)).parent != Path(os.path.realpath(folder)):
+        raise refused("refused-path", "A path is refused", [WrongField(pointer=pointer, detail=_allowed({}))])
 
 
 def over_limit(*wrong: WrongField) -> HttpError:
@@ -144,33 +173,14 @@ class QueueLimit:
 # --- files ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Uploads:
-    """Where the files of a request are kept: the server's path by the name that the request has for it."""
-
-    paths: Mapping[str, str]
-
-    def hide(self, error: CaseError) -> CaseError:
-        """The error in the request's own names."""
-        names = {path: name for name, path in self.paths.items()}
-        return CaseError(
-            Problem(p.key, names.get(p.value, p.value) if isinstance(p.value, str) else p.value, p.allowed)
-            for p in error.problems
-        )
-
-
-def with_uploads(
-    tree: Mapping[str, Any], files: Mapping[str, FileContent], settings: Settings, pointer: str
-) -> tuple[Tree, Uploads]:
-    """The tree with server paths for the names of files. Raises `HttpError` for a path that is not such a name."""
+def check_paths(tree: Mapping[str, Any], files: Mapping[str, FileContent], pointer: str) -> None:
+    """Raises `HttpError` for a path that is not the name of a file that came along."""
     if wrong := [
         WrongField(pointer=pointer + place, value=shown(value), detail=_allowed(files))
         for place, value in _paths(tree)
         if value not in files
     ]:
         raise refused("refused-path", "A path is refused", wrong)
-    uploads = Uploads({name: str(keep(name, file, settings.data)) for name, file in files.items()})
-    return (dict(tree) if not files else _replaced(tree, uploads.paths)), uploads
 
 
 def _allowed(files: Mapping[str, FileContent]) -> str:
@@ -203,28 +213,3 @@ def _replaced(tree: Any, paths: Mapping[str, str], key: str = "", depth: int = 0
     if isinstance(tree, str) and key.rpartition(".")[2] == "path":
         return paths[tree]
     return tree
-
-
-def keep(name: str, file: FileContent, data: Path) -> Path:
-    """Store the content under its hash, once; written beside, made durable, renamed."""
-    place = f"/files/{escaped(name)}"
-    suffix = re.sub(r"^.*(?=\.)", "", name, flags=re.DOTALL).lower()
-    if suffix not in SUFFIXES:
-        wrong = WrongField(pointer=place, value=shown(name), detail=f"must end in one of {', '.join(SUFFIXES)}")
-        raise refused("refused-file", "A file is refused", [wrong])
-    try:
-        content = file.content.encode() if file.encoding == "text" else base64.b64decode(file.content, validate=True)
-    except (binascii.Error, ValueError) as error:
-        wrong = WrongField(pointer=f"{place}/content", detail=f"not {file.encoding}: {error}")
-        raise refused("refused-file", "A file is refused", [wrong]) from None
-    folder = data.absolute() / "files"
-    path = folder / (hashlib.sha256(content).hexdigest() + suffix)
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        beside = folder / f".{path.name}.{os.getpid()}.{time.monotonic_ns()}"
-        with open(beside, "wb") as handle:
-            handle.write(content)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(beside, path)
-    return path

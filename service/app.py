@@ -144,12 +144,14 @@ async def submit_job(
     if key is not None and (before := store.known(key)) is not None:
         job = store.job(before)
     else:
-        if declared(request) >= SMALL or submission.files:
-            new = await asyncio.to_thread(admission.job_of, submission, engine.settings)
-        else:
-            new = admission.job_of(submission, engine.settings)
-        request.app.state.queue.admit(1)
-        job = await asyncio.wrap_future(store.submit(new, key))
+        admission.check_paths(submission.case, submission.files, "/case")
+        async with engine.shelf.taken(submission.files) as uploads:
+            if declared(request) >= SMALL or submission.files:
+                new = await asyncio.to_thread(admission.job_of, submission, engine.settings, uploads)
+            else:
+                new = admission.job_of(submission, engine.settings)
+            request.app.state.queue.admit(1)
+            job = await asyncio.wrap_future(store.submit(new, key))
     return made(job_view(engine, job), f"/v1/jobs/{job.id}")
 
 
@@ -279,10 +281,12 @@ async def submit_sweep(
     if key is not None and (before := store.known(key)) is not None:
         sweep = store.sweep(before)
     else:
-        new = await asyncio.to_thread(admission.sweep_of, submission, engine.settings)
-        request.app.state.queue.admit(len(new.points))
-        queued = store.submit_sweep(new.name, new.definition, new.points, new.duplicates, key)
-        sweep = await asyncio.wrap_future(queued)
+        admission.check_paths(submission.definition, submission.files, "/definition")
+        async with engine.shelf.taken(submission.files) as uploads:
+            new = await asyncio.to_thread(admission.sweep_of, submission, engine.settings, uploads)
+            request.app.state.queue.admit(len(new.points))
+            queued = store.submit_sweep(new.name, new.definition, new.points, new.duplicates, key)
+            sweep = await asyncio.wrap_future(queued)
     view = views.sweep_view(sweep, store.new_in_sweeps([sweep.seq])[sweep.seq])
     return made(view, f"/v1/sweeps/{sweep.id}")
 
@@ -339,8 +343,8 @@ async def show_limits(engine: TheEngine, who: Reader) -> views.Limits:
     return views.Limits(
         cores=s.cores, ranks=s.cores, body_bytes=s.body_limit, points_per_sweep=s.points_limit,
         values_per_body=s.values_limit, nodes_per_case=s.nodes_limit, particles_per_case=s.particles_limit,
-        rows_per_case=s.rows_limit, snapshots_per_case=s.snapshots_limit, memory_per_rank_bytes=s.memory_limit,
-        disk_per_job_bytes=s.disk_limit, sweep_bytes=s.sweep_bytes_limit, queued_jobs=s.queue_limit,
+        rows_per_case=s.rows_limit, snapshots_per_case=s.snapshots_limit, memory_bytes_per_core=s.memory_limit,
+        disk_bytes_per_case=s.disk_limit, bytes_per_sweep=s.sweep_limit, queued_jobs=s.queue_limit,
         page=filters.LARGEST_PAGE,
         states={str(state): sentence for state, sentence in SENTENCES.items()},
     )  # fmt: skip

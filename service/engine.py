@@ -3,7 +3,7 @@
 import asyncio
 import errno
 import os
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,10 +17,13 @@ from .scheduler import Scheduler
 from .security import check_address
 from .settings import Settings
 from .store import Key, NewPoint, Store, StoreError, SweepRecord
+from .uploads import Shelf
 
 if TYPE_CHECKING:
     from frit.sweeps.definition import Sweep
     from frit.sweeps.expand import Expansion
+
+TIDY = 3600.0  # seconds between two looks for uploads that nothing uses
 
 
 class EngineError(RuntimeError):
@@ -33,6 +36,7 @@ class Engine:
     store: Store
     hub: Hub
     scheduler: Scheduler
+    shelf: Shelf
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -55,11 +59,22 @@ class Engine:
             await self.scheduler.adopt()
             loop = asyncio.create_task(self.scheduler.run())
             stack.callback(loop.cancel)
+            self.shelf = Shelf(self.settings)
+            stack.callback(self.shelf.close)
+            tidying = asyncio.create_task(self._tidy())
+            stack.callback(tidying.cancel)
             self._stack = stack.pop_all()
         return self
 
     async def __aexit__(self, *_: object) -> None:
         await self._stack.aclose()
+
+    async def _tidy(self) -> None:
+        """Remove, every hour, uploads that nothing uses."""
+        while True:
+            with suppress(OSError, StoreError):  # it will go better the next time
+                await asyncio.to_thread(lambda: self.shelf.tidy(self.store.files_used()))
+            await asyncio.sleep(TIDY)
 
     async def cancel(self, identifier: str, key: Key | None = None) -> Job:
         """End a job: at once where it has no cores, else its runner is told. A key that came before changes nothing.

@@ -1,127 +1,184 @@
-"""What a case would take, reckoned before it is let in: nodes, particles, rows, snapshots, memory, disk.
+"""What a case will need, reckoned from its tables before anything is built, and which key is to blame for too much.
 
-All of it follows from a few numbers of the resolved case; nothing is built. Memory and disk were measured: 1.4 to
-2.4 kB a node in 2-D, 5.1 to 11.4 kB in 3-D, 0.27 GB a rank besides; checkpoints 140 to 530 bytes a node, snapshots up
-to 30, rows 230 bytes and 19 a particle. A run that takes more than it should is ended by its runner.
+Memory was measured as the largest resident set of the ranks (2 particles; one rank unless said): lattices 2-D 451 000
+nodes 0.98 GB, 72 000 nodes at gamma 0.5 0.43 GB; 3-D 94 000 nodes 0.80 GB, 258 000 nodes 1.77 GB, 94 000 nodes at gamma
+0.5 3.1 GB; meshes of gmsh 2-D 72 000 nodes 0.43 GB, 3-D 20 000 nodes 0.82 GB. So
+
+    memory = ranks RANK + nodes (NODE + pairs FACTORISED or TABLED) + nodes SLOT (slots beyond SLOTS)
+
+with the pairs of a material point and a node in its range, per node. A first run that compiles takes RANK.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from .problems import WrongField
+from frit.solver import amounts
+from frit.solver.mesh_file import MeshFileError, shapes
+
 from .settings import Settings
 
-RANK = 300_000_000  # bytes of memory of a rank without nodes
-NODE = {2: 2_500, 3: 10_000}  # bytes of memory of a node, by dimension
-CHECKPOINT, SNAPSHOT = 600, 30  # bytes of disk for a node
-ROW, ROW_PARTICLE = 250, 20  # bytes of disk for a history row, and for each particle in it
-UNKNOWN = 0.0  # nodes of a mesh that is read from a file: its size is known when it was read
+RANK = 450e6  # bytes: interpreter, libraries, compiled code and the compiler
+NODE = 1600.0  # bytes per node: fields, numbers of the integrator, mesh
+FACTORISED, TABLED = 6.0, 30.0  # bytes per pair of point and node: on lattices they are not all kept
+SLOTS, MANY_SLOTS = 6, 24  # order parameters per node that NODE has; as many as shared slots get to
+SLOT = 100.0  # bytes per node and further slot
+ROW = 800.0  # bytes: a line of history.jsonl, and the same in the index
+SNAPSHOT = 20.0  # bytes per node
+MESH = 100.0  # bytes per node, in snapshots.zarr
+NEIGHBOURS = 5000  # particles that lie within the reach of the largest around one that is packed, at most
 
-Case = Mapping[str, Any]
+Tree = Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Reckoned:
-    """One figure, the key and value that it follows from most, and what is allowed."""
+@dataclass(frozen=True)
+class Excess:
+    """What a case has too much of: the dotted key that is to blame, its value, and what is allowed."""
 
-    what: str
-    figure: float
-    most: float
     key: str
     value: Any
-
-    @property
-    def wrong(self) -> bool:
-        """Whether it is too much; a figure that is no number is."""
-        return not self.figure <= self.most
-
-    def field(self, pointer: str, where: str = "") -> WrongField:
-        """The problem, for a case that stands at `pointer`."""
-        detail = f"gives about {self.figure:.3g} {self.what}, must be at most {self.most:.6g}{where}"
-        return WrongField(pointer=f"{pointer}/{self.key.replace('.', '/')}", value=self.value, detail=detail)
+    allowed: str
 
 
-def too_much(case: Case, ranks: int, settings: Settings) -> Iterator[Reckoned]:
-    """All figures of a resolved case that are over the limits."""
-    yield from (one for one in reckon(case, ranks, settings) if one.wrong)
+@dataclass(frozen=True)
+class Need:
+    """Amounts that a case asks for; each may be infinite."""
+
+    nodes: float
+    points: float
+    particles: float
+    rows: float
+    snapshots: float
+    memory: float  # bytes, of all ranks
+    disk: float  # bytes
 
 
-def reckon(case: Case, ranks: int, settings: Settings) -> Iterator[Reckoned]:
-    """All figures of a resolved case."""
-    size, spacing, output = case["domain"]["size"], case["nodes"].get("spacing"), case["output"]
-    end, every, dim = case["time"]["end"], output["history_every"], len(size)
-    nodes, particles = estimated_nodes(size, spacing), particles_of(case)
-    rows, snapshots = _over(end, every), _snapshots(output["snapshots"], end)
-    memory = RANK * ranks + nodes * NODE[dim]
-    disk = nodes * (CHECKPOINT + SNAPSHOT * snapshots) + rows * (ROW + ROW_PARTICLE * particles)
-    node_key, node_value = ("nodes.spacing", spacing) if spacing is not None else ("nodes.path", None)
-    many, many_value = _particles_key(case["particles"])
-    disk_key = "output.snapshots" if nodes * SNAPSHOT * snapshots > rows * ROW else "output.history_every"
-    yield Reckoned("nodes", nodes, settings.nodes_limit, node_key, node_value)
-    yield Reckoned("particles", particles, settings.particles_limit, many, many_value)
-    yield Reckoned("history rows", rows, settings.rows_limit, "output.history_every", every)
-    yield Reckoned("snapshots", snapshots, settings.snapshots_limit, "output.snapshots", _shown(output["snapshots"]))
-    yield Reckoned(f"bytes of memory on {ranks} ranks", memory, settings.memory_limit * ranks, node_key, node_value)
-    yield Reckoned("bytes of disk", disk, settings.disk_limit, disk_key, None)
+def need(case: Tree, ranks: int) -> Need:
+    """Of a resolved case, as plain values."""
+    dim, end, output = len(case["domain"]["size"]), case["time"]["end"], case["output"]
+    nodes, points = mesh_of(case)
+    particles = particles_of(case["particles"])
+    rows = amounts.times(end, output["history_every"])
+    snapshots = snapshots_of(output["snapshots"], end)
+    shared = case["activation"]["few_order_parameters"]
+    slots = min(particles, MANY_SLOTS) if shared else particles
+    pair = FACTORISED if case["nodes"]["source"] == "lattice" else TABLED
+    memory = nodes * (NODE + SLOT * max(slots - SLOTS, 0)) + points * pair * in_range(case["shape_functions"], dim)
+    checkpoint = nodes * (16 + 24 * max(slots, SLOTS))
+    disk = ROW * rows + SNAPSHOT * nodes * snapshots + 2 * checkpoint + MESH * nodes
+    return Need(nodes, points, particles, rows, snapshots, ranks * RANK + memory, disk)
 
 
-def estimated_nodes(size: Sequence[float], spacing: float | None) -> float:
-    """Nodes of the lattice of nearest neighbours h in the box, its walls included; 0 for a mesh from a file.
-
-    Triangular: rows h sqrt(3)/2 apart; body-centred: two per cube of edge 2h / sqrt(3).
-    """
-    if spacing is None:
-        return UNKNOWN
-    pitch = [spacing, spacing * math.sqrt(3) / 2] if len(size) == 2 else [2 * spacing / math.sqrt(3)] * 3
-    counts = [_over(length, step) + 1 for length, step in zip(size, pitch, strict=True)]
-    return math.prod(counts) * (1 if len(size) == 2 else 2)
-
-
-def particles_of(case: Case) -> float:
-    """How many there are; of a packing by density, what its container holds at that density."""
-    particles, dim = case["particles"], len(case["domain"]["size"])
-    if particles["source"] != "packing":
-        return float(len(particles["centres"]))
-    if (count := particles.get("count")) is not None:
-        return float(count)
-    lower, upper = particles["container"]
-    solid = math.prod(b - a for a, b in zip(lower, upper, strict=True)) * particles["packing_density"]
-    ball = math.pi if dim == 2 else 4 / 3 * math.pi
+def mesh_of(case: Tree) -> tuple[float, float]:
+    """Nodes and material points: reckoned of a lattice or gmsh, told by frit's own mesh file."""
+    size, given = case["domain"]["size"], case["nodes"]
+    if given["source"] != "file":
+        nodes = amounts.nodes(size, given["spacing"])
+        return nodes, amounts.points(nodes, len(size))
     try:
-        return _over(solid, ball * _power_mean(particles, dim) ** dim)
-    except OverflowError:
-        return math.inf
+        found = shapes(given["path"])
+    except (OSError, MeshFileError):
+        return 0.0, 0.0  # the ranks will say so
+    return float(found.nodes), float(found.cells["triangle" if len(size) == 2 else "tetra"])
 
 
-def _power_mean(particles: Case, dim: int) -> float:
-    """(mean of R^dim)^(1 / dim) of a histogram, the mean radius of the others."""
-    if (mean := particles.get("mean_radius")) is not None:
-        return float(mean)
-    pairs = particles["histogram"]
-    total = sum(weight for _, weight in pairs)
-    return float(sum(weight / total * radius**dim for radius, weight in pairs) ** (1 / dim))
+def particles_of(given: Tree) -> float:
+    """How many there are, or will be packed at most."""
+    if given["source"] != "packing":
+        return float(len(given["centres"]))
+    if (count := given.get("count")) is not None:
+        return float(count)
+    mean, histogram = given.get("mean_radius") or 0.0, given.get("histogram") or ()
+    return amounts.packed(given["packing_density"], given["container"], mean, histogram)
 
 
-def _particles_key(particles: Case) -> tuple[str, Any]:
-    """What the number of particles follows from."""
-    if particles["source"] != "packing":
+def snapshots_of(given: Any, end: float) -> float:
+    """How many a run writes."""
+    return amounts.times(end, given["every"]) if isinstance(given, Mapping) else float(len(given))
+
+
+def in_range(shape: Tree, dim: int) -> float:
+    """Nodes within h sqrt(-ln(delta_0) / gamma) of a point; the corners of its cell with linear functions."""
+    if shape["kind"] == "linear":
+        return dim + 1.0
+    reach = math.sqrt(-math.log(shape["tolerance"]) / shape["gamma"])
+    return math.pi * reach**2 * 2 / math.sqrt(3) if dim == 2 else 4 / 3 * math.pi * reach**3 * 0.75 * math.sqrt(3)
+
+
+# --- too much
+
+
+def excesses(case: Tree, ranks: int, settings: Settings) -> Iterator[Excess]:
+    """All that a case has too much of for this service."""
+    asked = need(case, ranks)
+    spacing = blamed = _spacing(case)
+    if not case["activation"]["few_order_parameters"] and asked.particles > MANY_SLOTS:
+        blamed = ("activation.few_order_parameters", False)
+    if asked.nodes > settings.nodes_limit:
+        yield Excess(*spacing, f"gives about {asked.nodes:.3g} nodes, must be at most {settings.nodes_limit}")
+    if asked.particles > settings.particles_limit:
+        said = f"gives about {asked.particles:.3g} particles, must be at most {settings.particles_limit}"
+        yield Excess(*_amount(case["particles"]), said)
+    elif (near := neighbours(case["particles"], asked.particles)) > NEIGHBOURS:
+        key = "histogram" if case["particles"].get("histogram") else "std_radius"
+        said = f"mixes sizes so that the largest is near {near:.3g} others, must be at most {NEIGHBOURS}"
+        yield Excess(f"particles.{key}", case["particles"].get(key), said)
+    if asked.rows > settings.rows_limit:
+        said = f"gives {asked.rows:.3g} rows, must be at most {settings.rows_limit}"
+        yield Excess("output.history_every", case["output"]["history_every"], said)
+    if asked.snapshots > settings.snapshots_limit:
+        said = f"gives {asked.snapshots:.3g} snapshots, must be at most {settings.snapshots_limit}"
+        yield Excess(*_snapshots(case["output"]), said)
+    if asked.memory > (most := settings.memory_limit * ranks):
+        said = f"needs about {asked.memory:.3g} bytes of memory, must be at most {most:.3g} on {ranks} ranks"
+        yield Excess(*blamed, said)
+    if asked.disk > settings.disk_limit:
+        if SNAPSHOT * asked.nodes * asked.snapshots > 0.5 * asked.disk:
+            blamed = _snapshots(case["output"])
+        said = f"needs about {asked.disk:.3g} bytes on disk, must be at most {settings.disk_limit}"
+        yield Excess(*blamed, said)
+
+
+def neighbours(given: Tree, particles: float) -> float:
+    """How many particles are looked at around one that is packed: those within three widths of the largest."""
+    if given["source"] != "packing":
+        return 0.0
+    low, high = given["container"]
+    histogram, mean = given.get("histogram") or (), given.get("mean_radius") or 0.0
+    largest = max((radius for radius, _ in histogram), default=mean + 6 * (given.get("std_radius") or 0.0))
+    part = math.prod(min(1.0, 6 * largest / (b - a)) for a, b in zip(low, high, strict=True))
+    return particles * part
+
+
+def _spacing(case: Tree) -> tuple[str, Any]:
+    """The key that decides how many nodes there are."""
+    if case["nodes"]["source"] == "file":
+        return "nodes.path", None
+    return "nodes.spacing", case["nodes"]["spacing"]
+
+
+def _amount(given: Tree) -> tuple[str, Any]:
+    """The key that decides how many particles there are."""
+    if given["source"] != "packing":
         return "particles.centres", None
     for key in ("count", "mean_radius"):
-        if (value := particles.get(key)) is not None:
-            return f"particles.{key}", value
-    return "particles.histogram", None
+        if given.get(key) is not None:
+            return f"particles.{key}", given[key]
+    return "particles.histogram", given["histogram"]
 
 
-def _snapshots(given: Any, end: float) -> float:
-    return float(len(given)) if isinstance(given, Sequence) else _over(end, given["every"]) + 1
+def _snapshots(output: Tree) -> tuple[str, Any]:
+    given = output["snapshots"]
+    return ("output.snapshots.every", given["every"]) if isinstance(given, Mapping) else ("output.snapshots", None)
 
 
-def _shown(snapshots: Any) -> Any:
-    return snapshots if isinstance(snapshots, Mapping) else None
-
-
-def _over(a: float, b: float) -> float:
-    """a / b for positive numbers, infinite where it is too large for one."""
-    return a / b if b > 0 else math.inf
+def too_long(tree: Any, settings: Settings, key: str = "particles") -> Iterator[Excess]:
+    """Lists of particles in a table as it came, or in a list of such tables: told before they are looked into."""
+    tables = tree if isinstance(tree, list) else [tree]
+    for table in tables:
+        for name in ("centres", "radii", "sizes"):
+            given = table.get(name) if isinstance(table, Mapping) else None
+            if isinstance(given, list) and len(given) > settings.particles_limit:
+                said = f"has {len(given)} entries, must be at most {settings.particles_limit}"
+                yield Excess(f"{key}.{name}", None, said)

@@ -198,9 +198,9 @@ class Runner:
         return [str(self.directory / "submitted.json"), "--out", str(self.directory), "--progress"]
 
     def marks(self) -> dict[str, str]:
-        """By which a later runner finds what this one may leave behind."""
+        """By which a later runner finds what this one may leave behind; and where meshes of strangers are."""
         name, value = self.mark.split("=", 1)
-        return {name: value}
+        return {name: value, "FRIT_UPLOADS": str(self.directory.parent.parent / "files")}
 
     def clear(self) -> None:
         """End what an earlier attempt left behind, before its solver can get in this one's way."""

@@ -60,18 +60,26 @@ class Settings(BaseSettings):
     """points of a sweep, at most"""
     nodes_limit: AtLeastOne = 20_000_000
     """nodes of a case, at most"""
+    queue_limit: AtLeastOne = 200_000
+    """jobs waiting in the queue, at most"""
     particles_limit: AtLeastOne = 50_000
-    """particles of a case, at most"""
+    """particles of a case, at most; of a packing, as many as are reckoned before it is drawn"""
     rows_limit: AtLeastOne = 1_000_000
     """history rows of a case, at most"""
     snapshots_limit: AtLeastOne = 10_000
     """snapshots of a case, at most"""
     disk_limit: AtLeastOne = 100_000_000_000
-    """bytes that the run directory of a case may be reckoned to take, at most"""
-    sweep_bytes_limit: AtLeastOne = 200_000_000
+    """bytes that the results of a case take on disk, at most"""
+    sweep_limit: AtLeastOne = 300_000_000
     """bytes of all resolved cases of a sweep together, at most"""
-    queue_limit: AtLeastOne = 200_000
-    """jobs waiting in the queue, at most"""
+    upload_memory: AtLeastOne = 2_000_000_000
+    """bytes of memory for reading the meshes of a request, at most"""
+    upload_seconds: Seconds = 30.0
+    """seconds for reading the meshes of a request, at most, by the clock and of the processor"""
+    upload_bytes: AtLeastOne = 500_000_000
+    """bytes of a mesh once it is converted, at most"""
+    conversions: AtLeastOne = 2
+    """requests whose files are read at the same time"""
 
     @property
     def runs(self) -> Path:

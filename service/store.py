@@ -8,6 +8,7 @@ on the disk: what is acknowledged is durable, and many requests share one flush.
 import json
 import os
 import queue
+import re
 import sqlite3
 import threading
 import time
@@ -32,6 +33,7 @@ BATCH = 256  # pieces of work in one transaction, at most
 ASKED = 16  # indices that questions have made, at most
 FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
+UPLOADED = re.compile(r"\b[0-9a-f]{64}\.[a-z]+")  # the name of an uploaded file
 SUCCEEDED = 1 << 60  # more than any seq
 TROUBLE = {  # primary codes of SQLite's that tell of the database and its disk, not of one statement
     sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR,
@@ -510,6 +512,14 @@ class Store:
         """By its id, or by the first characters of it where they suffice. Raises `NotFoundError`."""
         with self.reading() as connection:
             return _job(connection, identifier)
+
+    def files_used(self) -> set[str]:
+        """Names of the uploads that a job or the definition of a sweep has a path to."""
+        with self.reading() as connection:
+            cases = connection.exec_driver_sql("SELECT DISTINCT json_extract(\"case\", '$.nodes.path') FROM jobs")
+            paths = [Path(path).name for (path,) in cases if path]
+            texts = connection.exec_driver_sql("SELECT definition FROM sweeps WHERE instr(definition, '/files/')")
+            return {*paths, *(name for (text,) in texts for name in UPLOADED.findall(text))}
 
     def jobs(
         self, where: sa.ColumnElement[bool] | None = None, order: Sequence[Any] = (), limit: int = 50

@@ -214,9 +214,9 @@ class Limits(BaseModel):
     particles_per_case: int
     rows_per_case: int
     snapshots_per_case: int
-    memory_per_rank_bytes: int
-    disk_per_job_bytes: int
-    sweep_bytes: int
+    memory_bytes_per_core: int
+    disk_bytes_per_case: int
+    bytes_per_sweep: int
     queued_jobs: int
     page: int
     states: dict[str, str]

@@ -13,10 +13,10 @@ import os
 import re
 import reprlib
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from itertools import count, islice, pairwise, takewhile
+from itertools import chain, count, islice, pairwise, takewhile
 from operator import ge
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -39,31 +39,59 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError, PydanticKnownError
+from pydantic_core import PydanticCustomError, PydanticKnownError
 
-from . import particle_file
+from . import amounts, overlaps, particle_file
 from .arrays import Flags, Floats
 from .characters import UNSHOWABLE
-from .pairs import near_pairs
 from .particle_file import ParticleFileError
 
 CANONICAL = json.JSONEncoder(sort_keys=True)
 PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
-MOST_PROBLEMS = 50  # that are told of a case
-MOST_COUNTED = 1000  # that are counted beyond these
-MOST_TIMES = 1e9  # steps, rows or snapshots of a run: more never end
-LONGEST = 1e12  # model time: beyond it steps are lost in round-off
-PART = 50  # items of a list that are checked before the next are
-LONGEST_KEY = 100  # characters of an unknown key that are compared with known ones
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
+SMALLEST, LARGEST = 1e-30, 1e30  # sizes of numbers: products of a few neither vanish nor overflow
+LONGEST_KEY = 100  # characters of an unknown key that are compared with known ones
+MOST_PROBLEMS = 50  # that are told one by one
+MOST_COUNTED = 1000  # that are counted beyond these
+MOST_NODES = 2**31 - 1  # nodes have 32-bit numbers
+MOST_ROWS = 1e9  # of the history
+MOST_SNAPSHOTS = 1e6
+MOST_STEPS = 1e12  # of rk2
+MOST_PARTICLES = 2**31 - 1
+MIXED = 1e6  # largest over smallest radius or edge: no mesh resolves both
+TOGETHER = 200  # items of a list that are checked at a time
 
 # --- vocabulary
 
+
+
+def _counted_on(x: float) -> float:
+    """A number that may be multiplied with others; -0.0 becomes 0.0, so that equal cases have one identity."""
+    if x and not SMALLEST <= abs(x) <= LARGEST:
+        words = "must be 0 or of a size between 1e-30 and 1e30" if x < 0 else "must be between 1e-30 and 1e30"
+        raise PydanticCustomError("size", words)
+    return x + 0.0
+
+
+def _in_parts(items: object, check: ValidatorFunctionWrapHandler) -> object:
+    """A long list is checked part by part up to the first that has something wrong: errors are not without end."""
+    if not isinstance(items, list | tuple) or len(items) <= TOGETHER:
+        return check(items)
+    parts = []
+    for start in range(0, len(items), TOGETHER):
+        try:
+            parts.append(check(items[start : start + TOGETHER]))
+        except (ValidationError, ValueError):
+            return check(items[: start + TOGETHER])  # once more, so that the errors have their numbers
+    return tuple(chain.from_iterable(parts))
+
+
 FINITE = Field(strict=True, allow_inf_nan=False)
-ONE_ZERO = AfterValidator(lambda x: x + 0.0)  # no -0.0: equal cases have one identity
-Number = Annotated[float, FINITE, ONE_ZERO]
-NonNegative = Annotated[float, FINITE, Field(ge=0), ONE_ZERO]
-Positive = Annotated[float, FINITE, Field(gt=0)]
+SIZED = AfterValidator(_counted_on)
+LONG = WrapValidator(_in_parts)
+Number = Annotated[float, FINITE, SIZED]
+NonNegative = Annotated[float, FINITE, Field(ge=0), SIZED]
+Positive = Annotated[float, FINITE, Field(gt=0), SIZED]
 Fraction = Annotated[float, FINITE, Field(gt=0, lt=1)]
 Flag = Annotated[bool, Field(strict=True)]
 
@@ -75,9 +103,6 @@ def showable(text: str) -> str:
     return text
 
 
-Text = Annotated[str, Field(strict=True), AfterValidator(showable)]
-
-
 def _few(value: object) -> object:
     """A list of coordinates, unless it is so long that its items need no look."""
     if isinstance(value, list | tuple) and len(value) > 3:
@@ -85,33 +110,9 @@ def _few(value: object) -> object:
     return value
 
 
-def _in_parts(value: object, check: ValidatorFunctionWrapHandler) -> Any:
-    """A long list, checked part by part up to the first that has something wrong: no errors without end."""
-    if not isinstance(value, list | tuple) or len(value) <= PART:
-        return check(value)
-    checked: list[Any] = []
-    for start in range(0, len(value), PART):
-        try:
-            checked += check(value[start : start + PART])
-        except ValidationError as error:
-            raise _shifted(error, start) from None
-    return tuple(checked)
-
-
-def _shifted(error: ValidationError, start: int) -> ValidationError:
-    """The same errors of items that stand `start` places further on."""
-    lines: list[InitErrorDetails] = []
-    for entry in error.errors(include_url=False):
-        first, *rest = entry["loc"]
-        words = entry["msg"].replace("{", "{{").replace("}", "}}")
-        kind = PydanticCustomError(entry["type"], words)
-        lines.append({"type": kind, "loc": (int(first) + start, *rest), "input": entry["input"]})
-    return ValidationError.from_exception_data(error.title, lines)
-
-
+Text = Annotated[str, Field(strict=True), AfterValidator(showable)]
 Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3), BeforeValidator(_few)]
 Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3), BeforeValidator(_few)]
-LONG = WrapValidator(_in_parts)
 Box = tuple[Point, Point]
 Place = tuple[str | int, ...]  # of a value in the tree: names, indices, and "|form" where it may have two
 
@@ -136,26 +137,29 @@ class Problem:
 
 
 class CaseError(ValueError):
-    """A refused case and what is wrong with it: one line of `str()` per problem.
+    """A refused case and what is wrong with it: one line of `str()` per problem, and one for the rest.
 
-    The first `MOST_PROBLEMS` are kept; `more` counts others, as far as they were looked for.
+    `problems` are the first MOST_PROBLEMS, `more` is how many others there are. Counting ends, so that a refusal takes
+    no time: with `more` at MOST_COUNTED or above there may be others still.
     """
 
     def __init__(self, problems: Iterable[Problem], more: int = 0) -> None:
-        found = iter(problems)
-        self.problems = tuple(islice(found, MOST_PROBLEMS))
-        self.more = more + sum(1 for _ in islice(found, MOST_COUNTED))
+        """more: problems known beside these."""
+        waiting = iter(problems)
+        self.problems = tuple(islice(waiting, MOST_PROBLEMS))
+        self.more = more + sum(1 for _ in islice(waiting, MOST_COUNTED))
         super().__init__(self.problems)
 
     def __str__(self) -> str:
-        lines = [*map(str, self.problems), *([f"and {self.more} more"] if self.more else [])]
-        return "\n".join(lines)
+        least = "at least " if self.more >= MOST_COUNTED else ""
+        return "\n".join([*map(str, self.problems), *([f"and {least}{self.more} more"] if self.more else [])])
 
 
 def _refuse(problems: Iterable[Problem]) -> None:
     """Raise them, if there are any. Validators give keys relative to what they validate."""
-    if found := tuple(problems):
-        raise CaseError(found)
+    waiting = iter(problems)
+    if (first := next(waiting, None)) is not None:
+        raise CaseError(chain([first], waiting))
 
 
 class Table(BaseModel):
@@ -326,9 +330,9 @@ class Particles(Table):
     packing_density: Fraction | None = None
     """solid fraction [1], within 0.005, of output.vacancy_box, or of the container where that box is not inside it
     or particles are poured (packing; this or count)"""
-    count: Annotated[int, Field(strict=True, ge=1)] | None = None
+    count: Annotated[int, Field(strict=True, ge=1, le=MOST_PARTICLES)] | None = None
     """number of particles (packing; this or packing_density)"""
-    seed: Annotated[int, Field(strict=True, ge=0)] | None = None
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] | None = None
     """seed of the random draw (packing; default 0)"""
     container: Box | None = None
     """lower and upper corner of the packed box, nm (packing)"""
@@ -345,7 +349,8 @@ class Particles(Table):
         name = "sizes" if self.shape == "box" else "radii"
         given, n = getattr(self, name), len(self.centres)
         if self.source == "list" and len(given) != n:
-            raise CaseError([Problem(name, list(given), f"must be {n}, one per centre, not {len(given)}")])
+            raise CaseError([Problem(name, list(given[:9]), f"must be {n}, one per centre, not {len(given)}")])
+        _refuse(_mixed(self))
         if self.source == "packing":
             _refuse(_packing_problems(self))
         return self
@@ -380,8 +385,7 @@ class Particles(Table):
         if self.container is not None:
             return self.container
         centres, half = self.extents()
-        with np.errstate(over="ignore"):  # huge numbers are refused, not warned of
-            return tuple((centres - half).min(axis=0).tolist()), tuple((centres + half).max(axis=0).tolist())
+        return tuple((centres - half).min(axis=0).tolist()), tuple((centres + half).max(axis=0).tolist())
 
 
 class Model(Table):
@@ -433,7 +437,7 @@ class Time(Table):
     owned: ClassVar = {("adaptive",): {"tolerance": 1e-3}, ("rk2",): {"step": None}}
     alone: ClassVar = ("end", "tolerance", "step")
 
-    end: Annotated[float, FINITE, Field(gt=0, le=LONGEST)]
+    end: Positive
     """t at the end of the run [1]"""
     integrator: Literal["adaptive", "rk2"] = "adaptive"
     """adaptive: with error control; rk2: two half Euler steps, eq. (32)"""
@@ -493,6 +497,12 @@ class Output(Table):
         """How often a checkpoint is written changes nothing."""
         return {key: value for key, value in tree.items() if key != "checkpoint_every"}
 
+    def snapshot_count(self, end: float) -> float:
+        """How many snapshots a run to `end` writes, reckoned without making them."""
+        if isinstance(self.snapshots, Every):
+            return amounts.times(end, self.snapshots.every)
+        return float(len(self.snapshots))
+
     def snapshot_times(self, end: float) -> tuple[float, ...]:
         """The times [1] of all snapshots of a run to `end`; round-off does not lose the last of `every`."""
         if not isinstance(self.snapshots, Every):
@@ -547,7 +557,7 @@ class Case(Table):
         try:
             centres, radii = particle_file.read(path, len(info.data["domain"].size), particles.units or "nm")
         except ParticleFileError as error:
-            raise CaseError(Problem("path", path, text) for text in error.problems) from error
+            raise CaseError((Problem("path", path, text) for text in error.problems), error.more) from error
         width = particles.interface_width
         return Particles(centres=centres.tolist(), radii=radii.tolist(), interface_width=width)
 
@@ -597,6 +607,14 @@ class Case(Table):
         """SHA-256 of all that changes the result: the essence of every table."""
         tables = self.tables().items()
         return fingerprint({name: canonical(table.essence(table.tree())) for name, table in tables})
+
+
+def _mixed(given: Particles) -> Iterator[Problem]:
+    """Sizes that no mesh resolves together."""
+    edges = given.radii or tuple(chain.from_iterable(given.sizes)) or tuple(radius for radius, _ in given.histogram)
+    if edges and max(edges) > MIXED * min(edges):
+        name = "radii" if given.radii else "sizes" if given.sizes else "histogram"
+        yield Problem(name, [min(edges), max(edges)], f"the largest must be at most {MIXED:g} times the smallest")
 
 
 def _packing_problems(given: Particles) -> Iterator[Problem]:
@@ -660,14 +678,13 @@ def disagreements(case: Case, agreed: bool = False) -> Iterator[Problem]:
     agreed: particles, domain and boxes are known to fit.
     """
     if case.particles.source == "list" and not agreed:
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused, not warned of
-            found = [*_particles_inside(case), *_particles_apart(case)]
-        yield from found
+        yield from _particles_inside(case)
+        yield from _particles_apart(case)
     yield from _particles_resolved(case)
     if not agreed:
         yield from _boxes_inside(case)
-    yield from _countable(case)
     yield from _times_in_order(case)
+    yield from _can_be_counted(case)
 
 
 def _inner_box(domain: Domain | None, particles: Particles | None) -> Box:
@@ -709,17 +726,17 @@ def _particles_apart(case: Case) -> Iterator[Problem]:
     centres, half = case.particles.extents()
     boxes = case.particles.shape == "box"
     found: list[tuple[int, int, float, float]] = []
-    for i, j in (pairs.T for pairs in near_pairs(centres, half.max(axis=1))):
+    for i, j in overlaps.near_pairs(centres, half):
         away, reach = np.abs(centres[i] - centres[j]), half[i] + half[j]
         shared = (reach - away).min(axis=1) if boxes else reach[:, 0] - np.linalg.norm(away, axis=1)
         limit = 0.5 * np.minimum(half[i].min(axis=1), half[j].min(axis=1))
-        wrong = np.flatnonzero(shared > limit * (1 + ROUND_OFF))[:MOST_COUNTED]
-        found += zip(*(a[wrong].tolist() for a in (i, j, shared, limit)), strict=True)
-        if len(found) > MOST_PROBLEMS:
+        bad = np.flatnonzero(shared > limit * (1 + ROUND_OFF))[:MOST_COUNTED]
+        found += zip(i[bad].tolist(), j[bad].tolist(), shared[bad].tolist(), limit[bad].tolist(), strict=True)
+        if len(found) > MOST_COUNTED:
             break
-    for i_, j_, overlap, most in sorted(found):
-        allowed = f"overlaps particles.centres[{i_}] by {overlap:g} nm, must be at most {most:g}"
-        yield Problem(f"particles.centres[{j_}]", centres[j_].tolist(), allowed)
+    for first, second, overlap, most in sorted(found):
+        allowed = f"overlaps particles.centres[{first}] by {overlap:g} nm, must be at most {most:g}"
+        yield Problem(f"particles.centres[{second}]", centres[second].tolist(), allowed)
 
 
 def _particles_resolved(case: Case) -> Iterator[Problem]:
@@ -745,18 +762,6 @@ def _boxes_inside(case: Case) -> Iterator[Problem]:
             yield Problem(key, list(box), f"must be inside the domain, {list(size)}")
 
 
-def _countable(case: Case) -> Iterator[Problem]:
-    """Nothing can be done more often than `MOST_TIMES` between t = 0 and the end."""
-    output, end = case.output, case.time.end
-    least = end / MOST_TIMES
-    often = {"output.history_every": output.history_every, "time.step": case.time.step}
-    if isinstance(output.snapshots, Every):
-        often["output.snapshots.every"] = output.snapshots.every
-    for key, value in often.items():
-        if value is not None and value < least:
-            yield Problem(key, value, f"must be at least {least:g}, time.end / {MOST_TIMES:g}")
-
-
 def _times_in_order(case: Case) -> Iterator[Problem]:
     end, step, snapshots = case.time.end, case.time.step, case.output.snapshots
     if step is not None and step > end:
@@ -767,6 +772,33 @@ def _times_in_order(case: Case) -> Iterator[Problem]:
             yield Problem(f"output.snapshots[{i}]", t, f"must be at most time.end, {end}")
         if t <= before:
             yield Problem(f"output.snapshots[{i}]", t, f"must be greater than the time before, {before}")
+
+
+def _can_be_counted(case: Case) -> Iterator[Problem]:
+    """What is asked for in numbers beyond all memory, time or kinds of integers."""
+    end, output, h = case.time.end, case.output, case.nodes.spacing
+    if h is not None and (n := amounts.nodes(case.domain.size, h)) > MOST_NODES:
+        yield Problem("nodes.spacing", h, f"gives about {n:.3g} nodes, must be at most {MOST_NODES}")
+    if (n := amounts.times(end, every := output.history_every)) > MOST_ROWS:
+        yield Problem("output.history_every", every, f"gives {n:.3g} rows, must be at most {MOST_ROWS:g}")
+    if (n := output.snapshot_count(end)) > MOST_SNAPSHOTS:
+        yield Problem(*snapshots_by(output), f"gives {n:.3g} snapshots, must be at most {MOST_SNAPSHOTS:g}")
+    step = (case.time.step or _rule(case)) if case.time.integrator == "rk2" else None
+    if step is not None and (n := amounts.quotient(end, step)) > MOST_STEPS:
+        yield Problem("time.end", end, f"takes {n:.3g} steps of {step:g}, must be at most {MOST_STEPS:g}")
+
+
+def snapshots_by(output: Output) -> tuple[str, float | None]:
+    """The key that decides how many snapshots there are, and its value where that is a number."""
+    if isinstance(output.snapshots, Every):
+        return "output.snapshots.every", output.snapshots.every
+    return "output.snapshots", None
+
+
+def _rule(case: Case) -> float | None:
+    """The step of rk2 where none is given; None: not known before a mesh is read."""
+    h = case.nodes.spacing
+    return None if h is None else amounts.paper_step(h, case.model.L, case.model.kappa_eta)
 
 
 # --- reading
@@ -805,20 +837,20 @@ def parse_case(tree: Mapping[str, Any], base: Path | None = None) -> Case:
         raise refusal(error, _table) from None
 
 
+def refusal(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> CaseError:
+    """What pydantic refused, in the words of a case file; `table_at` gives the table that holds a key."""
+    causes = [entry.get("ctx", {}).get("error") for entry in error.errors(include_url=False, include_input=False)]
+    more = sum(cause.more for cause in causes if isinstance(cause, CaseError))
+    return CaseError(problems(error, table_at), more)
+
+
 def _absolute(path: str, info: ValidationInfo) -> str:
     return os.path.abspath(((info.context or {}).get("base") or Path()) / path)
 
 
-def refusal(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> CaseError:
+def problems(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> Iterator[Problem]:
     """What pydantic refused, in the words of a case file; `table_at` gives the table that holds a key."""
     entries = error.errors(include_url=False)
-    causes = [entry["ctx"]["error"] for entry in entries if isinstance(entry.get("ctx", {}).get("error"), CaseError)]
-    return CaseError(_problems(entries, table_at), sum(cause.more for cause in causes))
-
-
-def _problems(
-    entries: Sequence[ErrorDetails], table_at: Callable[[Place], type[BaseModel]]
-) -> Iterator[Problem]:
     inside = {entry["loc"][:-1] for entry in entries}
     for entry in entries:
         loc, kind, cause = entry["loc"], entry["type"], entry.get("ctx", {}).get("error")

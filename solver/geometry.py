@@ -6,10 +6,11 @@ Lattices, gmsh and mesh files all end in `_build`, so every mesh has passed the 
 
 import io
 import math
+import os
 import threading
 import warnings
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from . import mesh_file
 from .arrays import Codes, Floats, Integers, Numbers
 
 if TYPE_CHECKING:
@@ -169,37 +171,78 @@ def _generate(gmsh: Any, box: tuple[float, ...], spacing: float) -> tuple[Floats
 
 
 def file_mesh(path: str | Path, size: Sequence[float]) -> Mesh:
-    """The triangles (2-D) or tetrahedra (3-D) of any file that meshio reads; its other cells are ignored.
+    """The triangles (2-D) or tetrahedra (3-D) of frit's own mesh file or any that meshio reads; it ignores other cells.
 
     Nodes of no cell are dropped. Refuses nodes outside the box [0, size], and 2-D meshes off a plane of
-    constant z.
+    constant z. What was uploaded to a service (FRIT_UPLOADS) is read only as frit's own file.
     """
     box = np.array(_checked_box(size, 1.0))
     dim, kind = len(box), CELL_KIND[len(box)]
     source = _read(path)
-    blocks = [block.data for block in source.cells if block.type == kind]
-    if not sum(map(len, blocks)):
-        found = ", ".join(f"{len(block.data)} {block.type}" for block in source.cells) or "nothing"
-        raise MeshError(f"{path}: no {kind} cells; the file holds: {found}")
-    nodes, cells = np.asarray(source.points, dtype=np.float64), np.concatenate(blocks)
-    bad = np.flatnonzero(((cells < 0) | (cells >= len(nodes))).any(axis=1))
-    if bad.size or nodes.ndim != 2 or nodes.shape[1] < dim:
-        where = f"{kind} {bad[0]} has nodes {cells[bad[0]]}" if bad.size else f"{dim} coordinates are needed"
-        raise MeshError(f"{path}: {where}, the file holds an array of nodes of shape {nodes.shape}")
+    nodes, cells = source.nodes, source.cells[kind]
+    if not len(cells):
+        others = ", ".join(f"{len(found)} {name}" for name, found in source.cells.items() if len(found))
+        raise MeshError(f"{path}: no {kind} cells; the file holds: {others or 'nothing'}")
+    if nodes.ndim != 2 or nodes.shape[1] < dim:
+        raise MeshError(f"{path}: {dim} coordinates are needed, the file has an array of nodes of shape {nodes.shape}")
+    _refuse_lost(path, kind, nodes, cells)
     _refuse_outside(path, nodes, np.unique(cells), box)
     return _build(np.ascontiguousarray(nodes[:, :dim]), cells.astype(np.int32), None)
 
 
-def _read(path: str | Path) -> Any:
-    """meshio's mesh; what meshio prints before it gives up, or exits, goes into the error."""
+def _refuse_lost(path: str | Path, kind: str, nodes: Floats, cells: Integers) -> None:
+    bad = np.flatnonzero(((cells < 0) | (cells >= len(nodes))).any(axis=1))
+    if bad.size:
+        where = f"{kind} {bad[0]} has nodes {cells[bad[0]]}"
+        raise MeshError(f"{path}: {where}, the file holds an array of nodes of shape {nodes.shape}")
+
+
+def _read(path: str | Path) -> mesh_file.Contents:
+    try:
+        with suppress(OSError):  # meshio says so
+            if mesh_file.is_own(path):
+                return mesh_file.read(path)
+    except mesh_file.MeshFileError as error:
+        raise MeshError(f"{path}: {error}") from error
+    uploads = os.environ.get("FRIT_UPLOADS")
+    if uploads and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(uploads)):
+        raise MeshError(f"{Path(path).name}: was uploaded in a form that is not read any more: upload it again")
+    return _foreign(path)
+
+
+def read_foreign(path: str | Path, kind: str) -> mesh_file.Contents:
+    """A mesh of meshio's format `kind`, complete in itself. Raises `MeshError`."""
+    found = _foreign(path, kind)
+    if found.nodes.ndim != 2 or found.nodes.shape[1] not in (2, 3):
+        raise MeshError(f"{path}: must have 2 or 3 coordinates per node, has an array of shape {found.nodes.shape}")
+    if not any(map(len, found.cells.values())):
+        raise MeshError(f"{path}: holds no triangles or tetrahedra")
+    for name in mesh_file.KINDS:
+        _refuse_lost(path, name, found.nodes, found.cells[name])
+    return found
+
+
+def _foreign(path: str | Path, kind: str | None = None) -> mesh_file.Contents:
+    """What meshio reads; what it prints before it gives up, or exits, goes into the error."""
     said = io.StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return import_module("meshio").read(path)
+            mesh = import_module("meshio").read(path, kind)
+            nodes = np.asarray(mesh.points, dtype=np.float64)
+            blocks: dict[str, list[Integers]] = {}
+            for block in mesh.cells:  # of those that are not used only the number is kept
+                used = block.type in mesh_file.KINDS
+                cells = np.asarray(block.data, dtype=np.int64) if used else np.empty((len(block.data), 0), np.int64)
+                blocks.setdefault(block.type, []).append(cells)
+            found = {name: np.concatenate(parts) for name, parts in blocks.items()}
+    except MemoryError:
+        raise
     except (Exception, SystemExit) as error:  # readers of broken files raise anything
         reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise MeshError(f"{path}: meshio cannot read it: {reason}") from error
+    none = {name: np.empty((0, corners), dtype=np.int64) for name, corners in mesh_file.KINDS.items()}
+    return mesh_file.Contents(nodes, none | found)
 
 
 def _refuse_outside(path: str | Path, nodes: Floats, used: Integers, box: Floats) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from . import dem
 from .arrays import Floats, Integers
-from .pack_measures import near, touching, volumes
+from .pack_measures import near_pairs, touching, volumes
 
 LOOSEST = {2: 0.34, 3: 0.17}  # solid fraction of the pile between its walls, by dimension
 SETTLED = {2: 0.75, 3: 0.55}  # solid fraction from which gravity takes over
@@ -167,7 +167,7 @@ class Heap:
         has moved wait for the next time.
         """
         sizes = np.bincount(cluster)
-        pairs, gaps = near(self.x, self.r, float(self._widest_gap()))
+        pairs, gaps = near_pairs(self.x, self.r, float(self._widest_gap()))
         across = cluster[pairs[:, 0]] != cluster[pairs[:, 1]]
         pairs, gaps = pairs[across], gaps[across]
         settled, joined = np.zeros(len(sizes), dtype=bool), False

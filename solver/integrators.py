@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from . import unknowns, vectors
+from . import amounts, unknowns, vectors
 from .arrays import Floats
 from .case import Case
 from .partition import Ranks
@@ -39,7 +39,7 @@ class Integrator(Protocol):
 
 def paper_step(shortest: float, case: Case) -> float:
     """dt = 0.1 d_min^2 / (2 L kappa_eta), d_min the smallest distance between nodes: the paper's rule (2.3)."""
-    return 0.1 * shortest**2 / (2.0 * case.model.L * case.model.kappa_eta)
+    return amounts.paper_step(shortest, case.model.L, case.model.kappa_eta)
 
 
 def contact_time(shortest: float, case: Case) -> float:

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from . import overlaps
 from .arrays import Flags, Floats, Integers
-from .pairs import near_pairs
 
 TOUCH = 1e-3  # of the mean radius: particles nearer than this touch
 SLICES = 48  # Gauss points through a sphere that a box cuts: an error below 1e-4 of the sphere, see the tests
@@ -129,7 +129,7 @@ class Touching:
 def touching(x: Floats, r: Floats, low: Floats, high: Floats) -> Touching:
     """The contacts of particles at x (n, dim) with radii r (n,) in the box [low, high]."""
     n, tolerance = len(r), TOUCH * float(r.mean())
-    pairs, gaps = near(x, r, tolerance)
+    pairs, gaps = near_pairs(x, r, tolerance)
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     _, cluster = connected_components(links, directed=False)
     away = np.stack([x - low - r[:, None], high - x - r[:, None]], axis=2)
@@ -138,18 +138,18 @@ def touching(x: Floats, r: Floats, low: Floats, high: Floats) -> Touching:
     return Touching(pairs, counts, cluster.astype(np.int64), away < tolerance, -deepest / float(r.mean()))
 
 
-def near(x: Floats, r: Floats, tolerance: float) -> tuple[Integers, Floats]:
+def near_pairs(x: Floats, r: Floats, tolerance: float) -> tuple[Integers, Floats]:
     """Pairs (p, 2), and their gaps (p,), of particles whose surfaces are nearer than the tolerance."""
-    kept = [np.empty((0, 2), np.int64)]
-    for pairs in near_pairs(x, r + 0.5 * tolerance):
-        kept.append(pairs[_gaps(x, r, pairs) < tolerance])
-    found = np.concatenate(kept)
-    found = found[np.lexsort(found.T[::-1])]
-    return found, _gaps(x, r, found)
-
-
-def _gaps(x: Floats, r: Floats, pairs: Integers) -> Floats:
-    return np.asarray(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) - r[pairs].sum(axis=1))
+    half = np.repeat((r + 0.5 * tolerance)[:, None], x.shape[1], axis=1)
+    kept, gaps = [np.empty((0, 2), dtype=np.int64)], [np.empty(0)]
+    for i, j in overlaps.near_pairs(x, half):
+        gap = np.linalg.norm(x[i] - x[j], axis=1) - (r[i] + r[j])
+        near = gap < tolerance
+        kept.append(np.stack([i[near], j[near]], axis=1))
+        gaps.append(gap[near])
+    pairs, gap = np.concatenate(kept), np.concatenate(gaps)
+    order = np.lexsort(pairs.T[::-1])
+    return pairs[order], gap[order]
 
 
 def density_profile(

@@ -7,7 +7,7 @@ the names of the columns (`r` will do for `radius`) are skipped.
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,32 +15,57 @@ import numpy as np
 from .arrays import Floats
 
 NANOMETRES = {"nm": 1.0, "um": 1e3, "mm": 1e6, "m": 1e9}  # in a unit
+MOST_WRONG, MOST_COUNTED = 50, 1000  # wrong cells that are told, and counted
+SHOWN = 40  # characters of a wrong cell
 
 
 class ParticleFileError(ValueError):
-    """A file that holds no particles; `problems` has a line per wrong line."""
+    """A file that holds no particles; `problems` has a line per wrong line, of the first, `more` counts the others."""
 
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = tuple(problems)
-        super().__init__("; ".join(problems))
+    def __init__(self, problems: Sequence[str], more: int = 0) -> None:
+        self.problems, self.more = tuple(problems), more
+        super().__init__("; ".join([*problems, *([f"and {more} more"] if more else [])]))
 
 
-def read(path: str | Path, dim: int, units: str = "nm") -> tuple[Floats, Floats]:
-    """Centres (n, dim) and radii (n,), nm, of a file whose lengths are in `units`."""
+def read(path: str | Path, dim: int, units: str = "nm", most: int | None = None) -> tuple[Floats, Floats]:
+    """Centres (n, dim) and radii (n,), nm, of a file whose lengths are in `units`.
+
+    most: particles beyond which it is refused without reading on.
+    """
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        with open(path, encoding="utf-8-sig") as file:
+            rows = _rows(file, [*"xyz"[:dim], "radius"], most)
     except (OSError, ValueError) as error:
+        if isinstance(error, ParticleFileError):
+            raise
         raise ParticleFileError([f"cannot be read: {error}"]) from error
-    table = {n: _cells(line) for n, line in enumerate(lines, start=1)}
-    table = {n: cells for n, cells in table.items() if cells != [""] and not cells[0].startswith("#")}
-    names = [*"xyz"[:dim], "radius"]
-    if table and [{"r": "radius"}.get(cell.lower(), cell.lower()) for cell in table[min(table)]] == names:
-        del table[min(table)]
-    wrong = [text for n, cells in table.items() for text in _wrong_cells(n, cells, names)]
-    if wrong or not table:
-        raise ParticleFileError(wrong or ["holds no particles"])
-    rows = np.array([list(map(float, cells)) for cells in table.values()]) * NANOMETRES[units]
-    return rows[:, :-1], rows[:, -1]
+    table = np.array(rows) * NANOMETRES[units]
+    return table[:, :-1], table[:, -1]
+
+
+def _rows(lines: Iterable[str], names: Sequence[str], most: int | None) -> list[list[float]]:
+    """The numbers of all lines. What is wrong is told up to MOST_WRONG lines, and counted."""
+    rows: list[list[float]] = []
+    wrong: list[str] = []
+    first, bad = True, 0
+    for number, line in enumerate(lines, start=1):
+        cells = _cells(line)
+        if cells == [""] or cells[0].startswith("#"):
+            continue
+        heading, first = first and [{"r": "radius"}.get(cell.lower(), cell.lower()) for cell in cells] == names, False
+        if heading:
+            continue
+        if found := [*_wrong_cells(number, cells, names)]:
+            wrong, bad = (wrong + found)[:MOST_WRONG], bad + len(found)
+        elif not bad:
+            rows.append([float(cell) for cell in cells])
+        if most is not None and len(rows) > most:
+            raise ParticleFileError([f"holds more than {most} particles"])
+        if bad >= MOST_COUNTED:
+            break
+    if wrong or not rows:
+        raise ParticleFileError(wrong or ["holds no particles"], bad - len(wrong))
+    return rows
 
 
 def write(path: Path, centres: Floats, radii: Floats) -> None:
@@ -68,4 +93,8 @@ def _wrong_cells(line: int, cells: Sequence[str], names: Sequence[str]) -> Itera
             good = False
         if not good:
             allowed = "a number greater than 0" if name == "radius" else "a number"
-            yield f"line {line}, column {column} ({name}) is {cell!r}, must be {allowed}"
+            yield f"line {line}, column {column} ({name}) is {_short(cell)!r}, must be {allowed}"
+
+
+def _short(cell: str) -> str:
+    return cell if len(cell) <= SHOWN else cell[: SHOWN - 3] + "..."

@@ -2,6 +2,7 @@
 
 import gc
 import json
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -64,13 +65,13 @@ def count(sweep: Sweep) -> int:
     return (sweep.sample.points or chosen) * sweep.sample.replicates
 
 
-def expand(sweep: Sweep, limit: int | None = None, size: int | None = None) -> Expansion:
+def expand(sweep: Sweep, limit: int | None = None, room: int | None = None) -> Expansion:
     """All points. Raises `CaseError` for more than `limit` points, before any is made, and for impossible cases.
 
-    size: of the text of all cases together, at most.
+    room: bytes of all resolved cases together, at most.
     """
     with _no_collections():
-        return _expand(sweep, limit, size)
+        return _expand(sweep, limit, math.inf if room is None else room)
 
 
 @contextmanager
@@ -85,7 +86,7 @@ def _no_collections() -> Iterator[None]:
             gc.enable()
 
 
-def _expand(sweep: Sweep, limit: int | None, size: int | None) -> Expansion:
+def _expand(sweep: Sweep, limit: int | None, room: float) -> Expansion:
     if limit is not None and (n := count(sweep)) > limit:
         raise CaseError([Problem("axes", None, f"give {n} points, must be at most {limit}")])
     with np.errstate(all="ignore"):  # what overflows is refused with its case
@@ -93,12 +94,12 @@ def _expand(sweep: Sweep, limit: int | None, size: int | None) -> Expansion:
     points: dict[str, Point] = {}
     refused: dict[tuple[str, str], Problem] = {}
     variations, trees = Variations(), _Trees(sweep.base, columns)
-    duplicates = bad = written = 0
+    duplicates = bad = more = 0
     for number, picks in enumerate(rows, start=1):
         try:
             case = variations.case(trees.tree(picks))
         except CaseError as error:
-            bad += 1
+            bad, more = bad + 1, more + error.more
             for problem in error.problems:
                 refused.setdefault((problem.key, str(problem)), _at(problem, number, columns, picks))
             if bad == MOST_REFUSED:
@@ -113,12 +114,11 @@ def _expand(sweep: Sweep, limit: int | None, size: int | None) -> Expansion:
         if sweep.sample.replicates > 1 and case.particles.seed is not None:
             parameters[SEED] = case.particles.seed  # the first one's may be a default
         text = case_text(name, texts)
-        if size is not None and (written := written + len(text)) > size:
-            allowed = f"give cases of more than {size} characters together after {len(points)} points"
-            raise CaseError([Problem("axes", None, f"{allowed}: list many particles in a file")])
+        if (room := room - len(text)) < 0:
+            raise CaseError([Problem("axes", None, f"give cases that are too large together, up to point {number}")])
         points[hashed] = Point(hashed, text, name, parameters)
     if refused:
-        raise CaseError(refused.values())
+        raise CaseError(refused.values(), more)
     return Expansion(tuple(points.values()), duplicates)
 
 

@@ -144,3 +144,13 @@ def final(client: TestClient, identifier: str) -> Tree:
 
     until(done)
     return found
+
+
+def gmsh_text(nodes: list[list[float]], triangles: list[list[int]]) -> bytes:
+    """A mesh of triangles (node numbers from 0) as gmsh writes it, version 2.2."""
+    places = "\n".join(f"{k} {x!r} {y!r} 0.0" for k, (x, y) in enumerate(nodes, start=1))
+    cells = "\n".join(f"{k} 2 0 {a + 1} {b + 1} {c + 1}" for k, (a, b, c) in enumerate(triangles, start=1))
+    return (
+        f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n{len(nodes)}\n{places}\n$EndNodes\n"
+        f"$Elements\n{len(triangles)}\n{cells}\n$EndElements\n"
+    ).encode()

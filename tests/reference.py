@@ -228,16 +228,14 @@ def mean_in_box(field: Callable[[Floats], Floats], low: Floats, high: Floats, po
     return float(values)
 
 
-def overlapping(centres: Floats, half: Floats, boxes: bool) -> list[tuple[int, int]]:
-    """Pairs i < j that overlap by more than half the smaller one: R_i + R_j - |r_i - r_j| > min(R_i, R_j) / 2.
+# --- boxes
 
-    half: (n, dim). For boxes, along the axis of the least overlap.
-    """
-    found = []
-    for i in range(len(centres)):
-        for j in range(i + 1, len(centres)):
-            away = np.abs(centres[i] - centres[j])
-            shared = min(half[i] + half[j] - away) if boxes else half[i, 0] + half[j, 0] - np.sqrt((away**2).sum())
-            if shared > 0.5 * min(half[i].min(), half[j].min()) * (1 + 1e-9):
-                found.append((i, j))
-    return found
+
+def meeting(x: Floats, half: Floats) -> set[tuple[int, int]]:
+    """All pairs i < j of boxes x +- half, both (n, dim), that have common points."""
+    return {
+        (i, j)
+        for j in range(len(x))
+        for i in range(j)
+        if all(abs(a - b) <= p + q for a, b, p, q in zip(x[i], x[j], half[i], half[j], strict=True))
+    }

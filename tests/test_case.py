@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from frit.solver.case import Case, CaseError, Model, Output, Table, case_schema, load_case, parse_case
+from frit.solver.case import Case, CaseError, Model, Output, Problem, Table, case_schema, load_case, parse_case
 
 Tree = dict[str, Any]
 
@@ -579,3 +579,74 @@ def test_anything_else_is_refused_not_crashed_on(changes: Tree) -> None:
         assert len(str(result).splitlines()) >= len(result.problems)
     else:
         assert parse_case(json.loads(result.resolved_json())) == result
+
+
+# --- too much
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"time.end": 1e308}, "time.end = 1e+308: must be between 1e-30 and 1e30"),
+        ({"model.A": 1e200}, "model.A = 1e+200: must be between 1e-30 and 1e30"),
+        ({"particles.interface_width": 5e-324}, "particles.interface_width = 5e-324: must be between 1e-30 and 1e30"),
+        ({"particles.centres": [[30, 30], [-1e300, 30]]}, "must be 0 or of a size between 1e-30 and 1e30"),
+        ({"output.history_every": 5e-324}, "output.history_every = 5e-324: must be between 1e-30 and 1e30"),
+        ({"output.history_every": 1e-9}, "output.history_every = 1e-09: gives 1e+10 rows, must be at most 1e+09"),
+        ({"output.snapshots": {"every": 1e-12}}, "output.snapshots.every = 1e-12: gives 1e+13 snapshots"),
+        ({"time.integrator": "rk2", "time.step": 1e-20}, "time.end = 10.0: takes 1e+21 steps of 1e-20"),
+        ({"time.integrator": "rk2", "model.L": 1e20}, "time.end = 10.0: takes 2e+22 steps of 5e-22"),
+        ({"nodes.spacing": 1e-6}, "nodes.spacing = 1e-06: gives about 6.93e+15 nodes, must be at most 2147483647"),
+        ({"nodes.spacing": 1e-25}, "nodes.spacing = 1e-25: gives about 6.93e+53 nodes"),
+        ({"particles": PACKING | {"count": 10**400, "packing_density": None}}, "particles.count"),
+        ({"particles": PACKING | {"seed": 2**70}}, "particles.seed"),
+    ],
+)
+def test_what_can_never_be_is_refused_with_key_value_and_limit(changes: Tree, words: str) -> None:
+    said = lines(altered(changes))
+    assert any(words in line for line in said), said
+
+
+def test_sizes_that_no_mesh_resolves_together_are_refused() -> None:
+    changes = {"particles.radii": [20.0, 1e-6], "nodes": {"source": "file", "path": __file__}}
+    words = "particles.radii = [1e-06, 20.0]: the largest must be at most 1e+06 times the smallest"
+    assert lines(altered(changes)) == [words]
+
+
+WRONG: list[Any] = ["a", None, -1.0, [], {}, [1, 2, 3, 4], ["x", "y"]]
+
+
+@pytest.mark.parametrize("key", ["centres", "radii", "sizes", "histogram", "snapshots", "container", "vacancy_box"])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_list_of_a_million_wrong_items_is_looked_at_only_so_far(key: str, wrong: Any) -> None:
+    table = "output" if key in ("snapshots", "vacancy_box") else "particles"
+    with pytest.raises(CaseError) as caught:
+        parse_case(altered({f"{table}.{key}": [wrong] * 1_000_000}))
+    assert len(caught.value.problems) + caught.value.more < 1500
+
+
+def test_a_wrong_item_far_into_a_list_has_its_number() -> None:
+    radii: list[Any] = [1.0] * 5000
+    radii[4321] = -1.0
+    tree = altered({"particles": {"centres": [[1.0, 1.0]] * 5000, "radii": radii}})
+    assert lines(tree) == ["particles.radii[4321] = -1.0: must be greater than 0"]
+
+
+def test_problems_without_end_are_told_in_part_and_counted_in_part() -> None:
+    one = Problem("a", 1, "must be 2")
+    few = CaseError([one] * 60)
+    assert (len(few.problems), few.more, str(few).splitlines()[-1]) == (50, 10, "and 10 more")
+    endless = CaseError(itertools.repeat(one), more=3)
+    assert str(endless).splitlines()[-1] == "and at least 1003 more"
+    again = pickle.loads(pickle.dumps(few))
+    assert (again.problems, again.more) == (few.problems, 10)
+    assert str(CaseError([one])) == "a = 1: must be 2"
+
+
+def test_a_file_of_wrong_lines_is_told_in_part(tmp_path: Path) -> None:
+    with pytest.raises(CaseError) as caught:
+        read_csv(tmp_path, "a,b,c\n" * 100)
+    assert (len(caught.value.problems), caught.value.more) == (50, 250)
+    with pytest.raises(CaseError, match=r"line 1 has 1 columns") as caught:
+        read_csv(tmp_path, "x\n" * 1_000_000)
+    assert caught.value.more == 950

@@ -14,7 +14,7 @@ import meshio
 import numpy as np
 import pandas as pd
 import pytest
-from asking import LONG, PACKING, TINY, Process, free_port, listening, until
+from asking import LONG, PACKING, TINY, Process, free_port, gmsh_text, listening, until
 
 from frit.service import Client, ProblemError, RemoteJob, RemoteSweep
 from frit.service import client as module
@@ -97,7 +97,7 @@ def test_a_mesh_is_read_here_and_computed_on_there(client: Client, tmp_path: Pat
     (tmp_path / "case.json").write_text(json.dumps({**TINY, "nodes": {"source": "file", "path": "own.vtk"}}))
     job = job_of(client.submit(tmp_path / "case.json").wait())
     assert job.state == "succeeded", job.message
-    assert job.parameters["nodes.path"].endswith(".vtk")
+    assert job.parameters["nodes.path"].endswith(".fritmesh"), "converted there"
 
 
 def test_what_is_wrong_here_already_is_not_sent(idle: Client, tmp_path: Path) -> None:
@@ -155,10 +155,10 @@ def test_a_sweep_is_told_by_its_base(idle: Client, tmp_path: Path) -> None:
 
 
 def test_a_sweep_uploads_the_meshes_along_its_axes(idle: Client, tmp_path: Path) -> None:
-    for name in ("a.msh", "b.msh"):
-        (tmp_path / name).write_text(name)
+    for name in ("a.msh", "bb.msh"):
+        (tmp_path / name).write_bytes(gmsh_text([[0.0, 0.0], [22.0, 0.0], [22.0, 13.0 + len(name)]], [[0, 1, 2]]))
     base: dict[str, Any] = {**TINY, "nodes": {"source": "file"}}
-    (tmp_path / "s.json").write_text(json.dumps({"base": base, "axes": {"nodes.path": ["a.msh", "b.msh"]}}))
+    (tmp_path / "s.json").write_text(json.dumps({"base": base, "axes": {"nodes.path": ["a.msh", "bb.msh"]}}))
     made = idle.submit_sweep(tmp_path / "s.json")
     assert made.data["points"] == 2
     assert str(tmp_path) not in json.dumps(made.refresh().data)

@@ -15,10 +15,10 @@ import httpx2
 import pytest
 import xarray as xr
 import zarr
-from asking import LONG, PACKING, TINY, Tree, final, listening, service, until
+from asking import LONG, PACKING, TINY, Tree, final, gmsh_text, listening, service, until
 from fastapi.testclient import TestClient
 
-from frit.service.reckoning import estimated_nodes
+from frit.solver import amounts, mesh_file
 from frit.solver.case import parse_case
 from frit.solver.geometry import lattice
 
@@ -196,7 +196,8 @@ def test_a_move_that_the_state_does_not_allow_is_a_conflict(idle: TestClient) ->
 # --- files
 
 
-MESH = b"not looked into before the run"
+SQUARE = [[0.0, 0.0], [22.0, 0.0], [22.0, 13.0], [0.0, 13.0]]
+MESH = gmsh_text(SQUARE, [[0, 1, 2], [0, 2, 3]])
 
 
 def file_case(path: str) -> Tree:
@@ -211,7 +212,7 @@ def test_a_mesh_comes_as_content_and_is_kept_under_its_hash(tmp_path: Path) -> N
         text = {"other.msh": {"content": MESH.decode()}}
         two = post(client, "/v1/jobs", {"case": file_case("other.msh"), "files": text}).json()
     kept = list((tmp_path / "files").iterdir())
-    assert [file.read_bytes() for file in kept] == [MESH]
+    assert [mesh_file.read(file).nodes[:, :2].tolist() for file in kept] == [SQUARE]
     assert one.json()["identity"] == two["identity"], "the name of a file is no part of the case"
     assert one.json()["case"]["nodes"]["path"] == kept[0].name, "the server's folder stays its own"
     assert str(tmp_path) not in one.text
@@ -240,7 +241,7 @@ def test_a_path_of_the_server_is_refused(idle: TestClient, path: str) -> None:
     problem(post(idle, "/v1/sweeps", {"definition": {**SWEEP, "base": path}}), 422)
 
 
-@pytest.mark.parametrize("name", ["x.xdmf", "x", "x.msh/../../y", "x.h5"])
+@pytest.mark.parametrize("name", ["x.xdmf", "x", "x.msh/../../y", "x.h5", "x.inp", "x.med"])
 def test_only_files_that_refer_to_no_others_are_taken(idle: TestClient, name: str) -> None:
     tree = problem(post(idle, "/v1/jobs", {"case": TINY, "files": {name: {"content": ""}}}), 422)
     assert tree["type"] == "/problems/refused-file"
@@ -281,8 +282,8 @@ def test_limits_are_told_and_kept(tmp_path: Path) -> None:
 def test_the_estimate_of_nodes_is_that_of_the_lattice() -> None:
     for size, spacing in [((40.0, 30.0), 1.0), ((22.0, 13.0), 0.5), ((12.0, 14.0, 16.0), 1.0)]:
         nodes = len(lattice(size, spacing).nodes)
-        assert estimated_nodes(size, spacing) == pytest.approx(nodes, rel=0.15)
-    assert estimated_nodes((1e300, 1e300), 1e-300) == float("inf")
+        assert amounts.nodes(size, spacing) == pytest.approx(nodes, rel=0.15)
+    assert amounts.nodes((1e300, 1e300), 1e-300) == float("inf")
 
 
 def test_an_index_that_cannot_be_used_is_told_with_a_time_to_come_back(tmp_path: Path) -> None:

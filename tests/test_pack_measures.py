@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frit.solver.arrays import Floats
-from frit.solver.pack_measures import density_profile, near, parts_inside, solid_fraction, touching, volumes
+from frit.solver.pack_measures import density_profile, near_pairs, parts_inside, solid_fraction, touching, volumes
 
 
 def halton(n: int, base: int) -> Floats:
@@ -74,7 +74,7 @@ def test_pairs_are_all_pairs_whatever_the_sizes() -> None:
         x = rng.uniform(0.0, 8.0, (80, 3))
         gap = np.linalg.norm(x[:, None] - x, axis=2) - r - r[:, None]
         expected = np.argwhere(np.triu(gap < 0.2, 1))
-        pairs, gaps = near(x, r, 0.2)
+        pairs, gaps = near_pairs(x, r, 0.2)
         assert pairs.tolist() == expected.tolist()
         np.testing.assert_allclose(gaps, gap[expected[:, 0], expected[:, 1]], atol=1e-12)
 

@@ -8,7 +8,7 @@ import pytest
 from frit.solver.arrays import Floats
 from frit.solver.case import Case, CaseError, parse_case
 from frit.solver.heap import Heap
-from frit.solver.pack_measures import density_profile, near, solid_fraction, touching
+from frit.solver.pack_measures import density_profile, near_pairs, solid_fraction, touching
 from frit.solver.packing import OVERLAP, TOLERANCE, Packing, make, request
 
 
@@ -87,7 +87,7 @@ def test_nothing_poured_hangs_in_the_air(size: list[float]) -> None:
     """Each particle lies on the floor or on a particle whose centre is lower."""
     packing = packed(size, count=90, std_radius=0.1)
     x, r = packing.centres, packing.radii
-    pairs, _ = near(x, r, 5e-3)
+    pairs, _ = near_pairs(x, r, 5e-3)
     upper = np.where(x[pairs[:, 0], -1] > x[pairs[:, 1], -1], pairs[:, 0], pairs[:, 1])
     held = np.bincount(upper, minlength=len(r)) > 0
     assert (held | (x[:, -1] - r < 5e-3)).all()

@@ -73,8 +73,15 @@ class Engine:
         """Remove, every hour, uploads that nothing uses."""
         while True:
             with suppress(OSError, StoreError):  # it will go better the next time
-                await asyncio.to_thread(lambda: self.shelf.tidy(self.store.files_used()))
+                await asyncio.to_thread(self._tidy_once)
             await asyncio.sleep(TIDY)
+
+    def _tidy_once(self) -> None:
+        """Nothing while there are more run directories than jobs: a lost index does not know what they use."""
+        with os.scandir(self.settings.runs) as folders:
+            runs = sum(1 for _ in folders)
+        if runs <= sum(self.store.counts().values()):
+            self.shelf.tidy(self.store.files_used())
 
     async def cancel(self, identifier: str, key: Key | None = None) -> Job:
         """End a job: at once where it has no cores, else its runner is told. A key that came before changes nothing.

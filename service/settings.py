@@ -74,7 +74,7 @@ class Settings(BaseSettings):
     """bytes of all resolved cases of a sweep together, at most"""
     upload_memory: AtLeastOne = 2_000_000_000
     """bytes of memory for reading the meshes of a request, at most"""
-    upload_seconds: Seconds = 30.0
+    upload_seconds: Seconds = 10.0
     """seconds for reading the meshes of a request, at most, by the clock and of the processor"""
     upload_bytes: AtLeastOne = 500_000_000
     """bytes of a mesh once it is converted, at most"""

@@ -130,11 +130,12 @@ class Shelf:
         except UnknownFileError as error:
             raise not_taken(name, str(error)) from None
         if kind == PARTICLES:
-            lines = content.splitlines()
+            text = content.rstrip(b"\r\n")
+            lines = text.count(b"\n") + text.count(b"\r") - text.count(b"\r\n") + 1
             most = self.settings.particles_limit
-            if len(lines) > most + SPARE_LINES:
-                raise not_taken(name, f"has {len(lines)} lines, must be at most {most} particles")
-            if max(map(len, lines), default=0) > LONGEST_LINE:
+            if lines > most + SPARE_LINES:
+                raise not_taken(name, f"has {lines} lines, must be at most {most} particles")
+            if max(map(len, content.splitlines()), default=0) > LONGEST_LINE:
                 raise not_taken(name, f"has a line longer than {LONGEST_LINE} bytes")
         return kind
 

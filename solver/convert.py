@@ -7,10 +7,12 @@ opened any more once the first is read, nor a program or a connection.
 """
 
 import json
+import re
 import resource
 import sys
 from typing import Any
 
+COUNT = re.compile(rb"^[ \t]*[A-Za-z]+[ \t]*=?\s{0,99}(\d{1,20})", re.MULTILINE)
 FORBIDDEN = ("subprocess.", "os.exec", "os.fork", "os.posix_spawn", "os.system", "socket.", "ctypes.", "shutil.")
 
 
@@ -30,6 +32,7 @@ def main() -> int:
     confine({name for source, _, target in asked for name in (source, target)})
     for source, kind, target in asked:
         try:
+            check_counts(source, kind)
             mesh_file.write(target, read_foreign(source, kind))
             wrong = None
         except MemoryError:
@@ -38,6 +41,18 @@ def main() -> int:
             wrong = str(error).removeprefix(f"{source}: ")
         print(json.dumps(wrong), flush=True)
     return 0
+
+
+def check_counts(source: str, kind: str) -> None:
+    """Refuse a text that announces more of something than it has bytes: a reader of it may look for them for ever."""
+    from .geometry import MeshError
+
+    if kind in ("medit", "su2"):
+        with open(source, "rb") as file:
+            content = file.read()
+        for found in COUNT.finditer(content):
+            if int(found[1]) > len(content):
+                raise MeshError(f"announces {found[1].decode()} of something, more than it has bytes")
 
 
 def prepare() -> None:

@@ -205,8 +205,8 @@ def test_a_bomb_in_a_vtu_hits_the_limit_of_memory(tmp_path: Path) -> None:
 
 
 def test_a_mesh_that_claims_to_be_huge_hits_the_limit_of_memory(tmp_path: Path) -> None:
-    text = b"MeshVersionFormatted 2\nDimension 3\nVertices\n900000000\n0 0 0 1\n"
-    said = refusal(tmp_path, text, "m.mesh", upload_memory=1_000_000_000)
+    text = b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 900000000 double\n0 0 0\n"
+    said = refusal(tmp_path, text, "m.vtk", upload_memory=1_000_000_000)
     assert "memory" in said or "cannot read it" in said
 
 
@@ -349,3 +349,56 @@ def test_ranks_read_of_uploads_only_what_was_converted(tmp_path: Path, monkeypat
     own.write_bytes(own.read_bytes()[:-8])
     with pytest.raises(MeshError, match="damaged"):
         file_mesh(own, SIZE)
+
+
+# --- nothing that a stranger sends makes a thread match for ever
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"<!---->" * 585, b"<!--" * 1000, b"<?xml" + b" ?>" * 1300, b"<" + b" " * 4000, b" %\n" * 1300, b" #\n" * 1300,
+        b"% \n " * 800, b"#" * 4000, b" " * 4000, b"\n" * 4000, b"1" * 4000 + b"x", b"1." * 2000, b"1e" * 2000,
+        b"MeshVersionFormatted" + b" " * 4000, b"NDIME" + b" " * 4000, b"$MeshFormat" + b" " * 4000,
+        b"<?xml encoding" + b" " * 4000 + b"?>", b"1," * 2000 + b"x", b"x,y,radius\n" + b"9" * 900,
+    ],
+)  # fmt: skip
+def test_what_is_looked_for_in_a_head_is_found_in_a_moment(head: bytes) -> None:
+    """A process that hangs here would hang the service; it is given twenty seconds, where it needs none."""
+    code = """if True:
+        import resource, sys
+        from frit.service.sniffing import UnknownFileError, kind_of
+        resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
+        try:
+            kind_of(sys.stdin.buffer.read())
+        except UnknownFileError:
+            pass
+    """
+    assert subprocess.run([sys.executable, "-P", "-c", code], input=head, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"MeshVersionFormatted 2\nDimension 2\nRidges\n1000000000\n1\n", b"NDIME= 2\nNPOIN= 99999999999\n0 0 0\n",
+        b"MeshVersionFormatted 2\nDimension\n2\nVertices\n99999999999999999999\n",
+    ],
+)  # fmt: skip
+def test_a_text_that_announces_more_than_it_has_is_not_read(tmp_path: Path, text: bytes) -> None:
+    assert refusal(tmp_path, text).startswith("announces ")
+
+
+def test_uploads_stay_where_the_index_does_not_know_all_runs(tmp_path: Path) -> None:
+    """A service that was started before `frit reindex` would remove what the jobs of the lost index use."""
+    path = taken(tmp_path, MESH)
+    os.utime(path, (0, 0))
+    (tmp_path / "runs" / "0123456789abcdef").mkdir(parents=True)
+    with service(tmp_path):
+        time.sleep(1.0)
+    assert path.exists()
+    (tmp_path / "runs" / "0123456789abcdef").rmdir()
+    with service(tmp_path):
+        deadline = time.monotonic() + 60.0
+        while path.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)

@@ -142,7 +142,7 @@ class Scheduler:
         request = {"attempt": job.attempt, "stop": reason}
         try:
             if job.state is State.STARTING:  # its runner may be on the way up
-                await asyncio.to_thread(directory.mkdir, parents=True, exist_ok=True)
+                await asyncio.to_thread(directory.mkdir, exist_ok=True)
             await asyncio.to_thread(write_json, directory / "request.json", request)
         except OSError as error:  # a full disk: it is released then, and the index knows what else was wanted
             self._complain(f"job {job.id}: {error}")
@@ -244,9 +244,13 @@ class Scheduler:
         await self._end(job, end)
 
     async def _lose(self, job: Job, error: FolderError, process: Process | None = None) -> None:
-        """For good: there is nothing left to go on with, and nobody is to compute into the void."""
+        """For good: there is nothing left to go on with, and nobody is to compute into the void.
+
+        Where the folder of all runs is gone too, a disk is: its jobs may go on once it is back.
+        """
         await self.backend.clear(self.settings.runs / job.id, process)
-        await self._end(job, Exit(job.attempt, Move.LOSE, str(error), time.time(), again=False))
+        again = not self.settings.runs.is_dir()
+        await self._end(job, Exit(job.attempt, Move.LOSE, str(error), time.time(), again=again))
 
     async def _end(self, job: Job, end: Exit) -> None:
         """Into the index with it, history first, and its cores back."""
@@ -373,7 +377,7 @@ class Scheduler:
 
 def make_directory(directory: Path, job: Job) -> None:
     """The run directory as a runner expects it: the case, and who asked for what."""
-    directory.mkdir(parents=True, exist_ok=True)
+    directory.mkdir(exist_ok=True)  # not its parent: where that is gone, a disk is
     submitted = directory / "submitted.json"
     if not submitted.exists():
         write_whole(submitted, job.case.encode(), durable=False)

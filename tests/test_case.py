@@ -650,3 +650,22 @@ def test_a_file_of_wrong_lines_is_told_in_part(tmp_path: Path) -> None:
     with pytest.raises(CaseError, match=r"line 1 has 1 columns") as caught:
         read_csv(tmp_path, "x\n" * 1_000_000)
     assert caught.value.more == 950
+
+
+def test_a_list_of_coordinates_is_not_looked_through_where_it_is_too_long() -> None:
+    particles = {"centres": [["x"] * 100_000] * 3, "radii": [1.0] * 3}
+    with pytest.raises(CaseError) as raised:
+        parse_case({**minimal(), "particles": particles})
+    told = [problem for problem in raised.value.problems if problem.key.startswith("particles.centres")]
+    assert [problem.key for problem in told] == [f"particles.centres[{k}]" for k in range(3)]
+    assert "at most 3 items" in told[0].allowed
+
+
+def test_only_the_beginning_of_a_refused_value_is_written_out() -> None:
+    assert len(str(Problem("key", ["x" * 1000] * 1_000_000, "no"))) < 120
+
+
+@pytest.mark.parametrize("text", ["\x1b[31mRED", "a\nb", "\x9b", "\u202e", "\u2028", "\ud800"])
+def test_a_name_has_no_control_characters(text: str) -> None:
+    with pytest.raises(CaseError, match=r"name = .*: must have no control characters"):
+        parse_case({**minimal(), "name": text})

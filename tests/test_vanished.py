@@ -336,3 +336,23 @@ def test_a_lock_that_somebody_else_holds_keeps_no_cores(tmp_path: Path) -> None:
             assert job.state is State.LOST
 
     asyncio.run(main())
+
+
+def test_a_disk_that_goes_away_and_comes_back_loses_no_job(tmp_path: Path, standing_in: None) -> None:
+    """All run folders are gone at once: that is no deletion, and nothing is begun anew beside them."""
+
+    async def story() -> None:
+        async with Engine(settings(tmp_path, attempts=50)) as engine:
+            (job,) = await submit(engine, new_job("sleep 1"))
+            await runs(engine, job)
+            before = runner_of(engine, job)
+            engine.settings.runs.rename(tmp_path / "unplugged")
+            await until(engine, lambda: not lives(before))
+            await until(engine, lambda: engine.store.job(job.id).failures > 1)
+            assert not engine.settings.runs.exists()
+            (tmp_path / "unplugged").rename(engine.settings.runs)
+            (job,) = await ended(engine, job)
+            assert job.state is State.SUCCEEDED
+            assert not of_data(engine.settings.data)
+
+    asyncio.run(story())

@@ -144,7 +144,8 @@ async def submit_job(
     if key is not None and (before := store.known(key)) is not None:
         job = store.job(before)
     else:
-        admission.check_paths(submission.case, submission.files, "/case")
+        if submission.files:
+            await asyncio.to_thread(admission.check_paths, submission.case, submission.files, "/case")
         async with engine.shelf.taken(submission.files) as uploads:
             if declared(request) >= SMALL or submission.files:
                 new = await asyncio.to_thread(admission.job_of, submission, engine.settings, uploads)
@@ -281,7 +282,8 @@ async def submit_sweep(
     if key is not None and (before := store.known(key)) is not None:
         sweep = store.sweep(before)
     else:
-        admission.check_paths(submission.definition, submission.files, "/definition")
+        if submission.files:
+            await asyncio.to_thread(admission.check_paths, submission.definition, submission.files, "/definition")
         async with engine.shelf.taken(submission.files) as uploads:
             new = await asyncio.to_thread(admission.sweep_of, submission, engine.settings, uploads)
             request.app.state.queue.admit(len(new.points))

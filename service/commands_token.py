@@ -44,6 +44,7 @@ def revoke(
     except (NotFoundError, StoreError) as error:
         refuse(str(error))
     typer.echo(json.dumps({"name": name, "revoked": True}) if as_json else f"{name}: revoked")
+    say_if_none(data)
 
 
 @app.command(name="list")
@@ -62,9 +63,24 @@ def show(data: DataFolder = Path("data"), as_json: AsJson = False) -> None:
     ]
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
+    else:
+        for row in rows:
+            typer.echo(f"{row['name']:24}{row['scope']:8}{row['created']}  {row['revoked'] or 'active'}")
+    say_if_none(data)
+
+
+def say_if_none(data: Path) -> None:
+    """On stderr: that the service answers nobody any more, and what to do."""
+    from . import tokens
+    from .store import StoreError
+
+    try:
+        shut = tokens.is_marked(data) and all(token.revoked for token in tokens.listed(data))
+    except StoreError:
         return
-    for row in rows:
-        typer.echo(f"{row['name']:24}{row['scope']:8}{row['created']}  {row['revoked'] or 'active'}")
+    if shut:
+        way = f"`frit token create --name NAME --scope submit --data {data}` makes one"
+        typer.echo(f"no token is active, and without one nobody is served: {way}", err=True)
 
 
 def day(seconds: float | None) -> str | None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from importlib.metadata import requires
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from asking import LONG, PACKING, TINY, Process, free_port, gmsh_text, listening, until
+from packaging.requirements import Requirement
 
 from frit.service import Client, ProblemError, RemoteJob, RemoteSweep
 from frit.service import client as module
@@ -61,6 +63,13 @@ def test_importing_the_package_imports_nothing_else() -> None:
     code = "import sys, frit.service; print(sum(m.startswith(('frit', 'httpx2', 'pandas')) for m in sys.modules))"
     shown = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
     assert shown.stdout.split() == ["2"]
+
+
+@pytest.mark.parametrize("name", ["fsspec", "aiohttp", "xarray", "zarr"])
+def test_a_plain_install_brings_what_snapshots_by_url_need(name: str) -> None:
+    """xarray.open_zarr(job.zarr_url), as the README has it."""
+    plain = [Requirement(text) for text in requires("frit") or () if "extra ==" not in text]
+    assert name in {requirement.name for requirement in plain}
 
 
 def test_submit_wait_history_as_in_the_contract(client: Client, tmp_path: Path) -> None:

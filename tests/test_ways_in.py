@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from asking import LONG, TINY, free_port, listening, service, settings_in, until
 from fastapi.testclient import TestClient
+from typer.testing import CliRunner
 
-from frit.service import tokens
+from frit.service import commands_token, tokens
 from frit.service.app import create_app
 from frit.service.engine import check
 from frit.service.reindex import rebuild
@@ -105,6 +106,16 @@ def test_the_mark_is_there_before_the_first_token(tmp_path: Path, monkeypatch: p
     with pytest.raises(KeyboardInterrupt):
         tokens.create(tmp_path, "me", "read")
     assert tokens.is_marked(tmp_path)
+
+
+def test_who_has_revoked_the_last_token_is_told_what_to_do(tmp_path: Path) -> None:
+    run, data = CliRunner(), ["--data", str(tmp_path)]
+    assert run.invoke(commands_token.app, ["list", *data]).stderr == ""
+    tokens.create(tmp_path, "me", "read")
+    tokens.create(tmp_path, "you", "read")
+    assert run.invoke(commands_token.app, ["revoke", "me", *data]).stderr == ""
+    for words in (["revoke", "you"], ["list"], ["list", "--json"]):
+        assert "frit token create" in run.invoke(commands_token.app, [*words, *data]).stderr
 
 
 # --- peers

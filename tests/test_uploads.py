@@ -18,9 +18,9 @@ import meshio
 import numpy as np
 import pytest
 from asking import TINY, Tree, gmsh_text, service
-from engines import PAIR, ended, settings
-from engines import submit as submit_to
 from fastapi.testclient import TestClient
+from serving import PAIR, ended, settings
+from serving import submit as submit_to
 
 from frit.service.engine import Engine
 from frit.service.jobs import Job, NewJob, State

@@ -198,8 +198,9 @@ def _paths(tree: Any, key: str = "", place: str = "") -> Iterator[tuple[str, str
             if isinstance(value, dict | list) or (isinstance(value, str) and str(name).endswith("path")):
                 yield from _paths(value, str(name), f"{place}/{escaped(str(name))}")
     elif isinstance(tree, list):
+        looked = (str, Mapping) if key.rpartition(".")[2] == "path" else Mapping  # lists may be long
         for number, value in enumerate(tree):
-            if isinstance(value, str | Mapping):
+            if isinstance(value, looked):
                 yield from _paths(value, key, f"{place}/{number}")
     elif isinstance(tree, str) and key.rpartition(".")[2] == "path":
         yield place, tree

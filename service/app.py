@@ -134,7 +134,8 @@ async def submit_job(
         job = store.job(before)
     else:
         large = int(request.headers.get("content-length", IN_THREAD)) >= IN_THREAD
-        admission.check_paths(submission.case, submission.files, "/case")
+        if submission.files:
+            await asyncio.to_thread(admission.check_paths, submission.case, submission.files, "/case")
         async with engine.shelf.taken(submission.files) as uploads:
             if large or submission.files:
                 new = await asyncio.to_thread(admission.job_of, submission, engine.settings, uploads)
@@ -271,7 +272,8 @@ async def submit_sweep(
     if key is not None and (before := store.known(key)) is not None:
         sweep = store.sweep(before)
     else:
-        admission.check_paths(submission.definition, submission.files, "/definition")
+        if submission.files:
+            await asyncio.to_thread(admission.check_paths, submission.definition, submission.files, "/definition")
         async with engine.shelf.taken(submission.files) as uploads:
             new = await asyncio.to_thread(admission.sweep_of, submission, engine.settings, uploads)
             request.app.state.queue.admit(len(new.points))

@@ -2,11 +2,13 @@
 
 Memory was measured as the largest resident set of the ranks (2 particles; one rank unless said): lattices 2-D 451 000
 nodes 0.98 GB, 72 000 nodes at gamma 0.5 0.43 GB; 3-D 94 000 nodes 0.80 GB, 258 000 nodes 1.77 GB, 94 000 nodes at gamma
-0.5 3.1 GB; meshes of gmsh 2-D 72 000 nodes 0.43 GB, 3-D 20 000 nodes 0.82 GB. So
+0.5 3.1 GB; meshes of gmsh 2-D 72 000 nodes 0.43 GB, 3-D 20 000 nodes 0.82 GB, 94 000 as reckoned (54 000 in truth) 3.0
+GB. Packs: 144 discs on 212 000 nodes 0.62 GB, 27 spheres on 94 000 nodes 0.90 GB. Two ranks with 212 000 nodes of 2-D:
+0.88 GB together. So
 
-    memory = ranks RANK + nodes (NODE + pairs FACTORISED or TABLED) + nodes SLOT (slots beyond SLOTS)
+    memory = ranks RANK + nodes (NODE + SLOT (slots beyond SLOTS)) + pairs PAIR
 
-with the pairs of a material point and a node in its range, per node. A first run that compiles takes RANK.
+with the pairs of a material point and a node in its range. A first run that compiles takes RANK.
 """
 
 import math
@@ -21,10 +23,11 @@ from .settings import Settings
 
 RANK = 450e6  # bytes: interpreter, libraries, compiled code and the compiler
 NODE = 1600.0  # bytes per node: fields, numbers of the integrator, mesh
-FACTORISED, TABLED = 6.0, 30.0  # bytes per pair of point and node: on lattices they are not all kept
-SLOTS, MANY_SLOTS = 6, 24  # order parameters per node that NODE has; as many as shared slots get to
+PAIR = {"lattice": 6.0, "gmsh": 40.0, "file": 75.0}  # bytes: on lattices few are kept; of gmsh more nodes are reckoned
+SLOTS = 6  # order parameters per node that NODE has
+MANY_SLOTS = {2: 8, 3: 24}  # as many as shared slots get to: 6 in 2-D with 144 particles, 21 in 3-D with 150
 SLOT = 100.0  # bytes per node and further slot
-ROW = 800.0  # bytes: a line of history.jsonl, and the same in the index
+ROW, ROW_PARTICLE = 720.0, 40.0  # bytes, and more per particle: a line of history.jsonl, and the same in the index
 SNAPSHOT = 20.0  # bytes per node
 MESH = 100.0  # bytes per node, in snapshots.zarr
 NEIGHBOURS = 5000  # particles that lie within the reach of the largest around one that is packed, at most
@@ -62,11 +65,11 @@ def need(case: Tree, ranks: int) -> Need:
     rows = amounts.times(end, output["history_every"])
     snapshots = snapshots_of(output["snapshots"], end)
     shared = case["activation"]["few_order_parameters"]
-    slots = min(particles, MANY_SLOTS) if shared else particles
-    pair = FACTORISED if case["nodes"]["source"] == "lattice" else TABLED
-    memory = nodes * (NODE + SLOT * max(slots - SLOTS, 0)) + points * pair * in_range(case["shape_functions"], dim)
+    slots = min(particles, MANY_SLOTS[dim]) if shared else particles
+    pairs = points * in_range(case["shape_functions"], dim)
+    memory = nodes * (NODE + SLOT * max(slots - SLOTS, 0)) + pairs * PAIR[case["nodes"]["source"]]
     checkpoint = nodes * (16 + 24 * max(slots, SLOTS))
-    disk = ROW * rows + SNAPSHOT * nodes * snapshots + 2 * checkpoint + MESH * nodes
+    disk = (ROW + ROW_PARTICLE * particles) * rows + SNAPSHOT * nodes * snapshots + 2 * checkpoint + MESH * nodes
     return Need(nodes, points, particles, rows, snapshots, ranks * RANK + memory, disk)
 
 
@@ -113,7 +116,7 @@ def excesses(case: Tree, ranks: int, settings: Settings) -> Iterator[Excess]:
     """All that a case has too much of for this service."""
     asked = need(case, ranks)
     spacing = blamed = _spacing(case)
-    if not case["activation"]["few_order_parameters"] and asked.particles > MANY_SLOTS:
+    if not case["activation"]["few_order_parameters"] and asked.particles > MANY_SLOTS[3]:
         blamed = ("activation.few_order_parameters", False)
     if asked.nodes > settings.nodes_limit:
         yield Excess(*spacing, f"gives about {asked.nodes:.3g} nodes, must be at most {settings.nodes_limit}")
@@ -136,6 +139,8 @@ def excesses(case: Tree, ranks: int, settings: Settings) -> Iterator[Excess]:
     if asked.disk > settings.disk_limit:
         if SNAPSHOT * asked.nodes * asked.snapshots > 0.5 * asked.disk:
             blamed = _snapshots(case["output"])
+        elif (ROW + ROW_PARTICLE * asked.particles) * asked.rows > 0.5 * asked.disk:
+            blamed = "output.history_every", case["output"]["history_every"]
         said = f"needs about {asked.disk:.3g} bytes on disk, must be at most {settings.disk_limit}"
         yield Excess(*blamed, said)
 

@@ -86,7 +86,7 @@ def _no_collections() -> Iterator[None]:
             gc.enable()
 
 
-def _expand(sweep: Sweep, limit: int | None, room: float) -> Expansion:
+def _expand(sweep: Sweep, limit: int | None, most: float) -> Expansion:
     if limit is not None and (n := count(sweep)) > limit:
         raise CaseError([Problem("axes", None, f"give {n} points, must be at most {limit}")])
     with np.errstate(all="ignore"):  # what overflows is refused with its case
@@ -95,6 +95,7 @@ def _expand(sweep: Sweep, limit: int | None, room: float) -> Expansion:
     refused: dict[tuple[str, str], Problem] = {}
     variations, trees = Variations(), _Trees(sweep.base, columns)
     duplicates = bad = more = 0
+    room = most
     for number, picks in enumerate(rows, start=1):
         try:
             case = variations.case(trees.tree(picks))
@@ -114,8 +115,11 @@ def _expand(sweep: Sweep, limit: int | None, room: float) -> Expansion:
         if sweep.sample.replicates > 1 and case.particles.seed is not None:
             parameters[SEED] = case.particles.seed  # the first one's may be a default
         text = case_text(name, texts)
-        if (room := room - len(text)) < 0:
-            raise CaseError([Problem("axes", None, f"give cases that are too large together, up to point {number}")])
+        common = sum(len(text.tree) for table, text in texts.items() if table not in trees.members)
+        room -= len(text)
+        if room < 0 or (not points and common * count(sweep) > most):
+            allowed = f"give {count(sweep)} cases that take more than {most:.3g} bytes together, which is the limit"
+            raise CaseError([Problem("axes", None, allowed)])
         points[hashed] = Point(hashed, text, name, parameters)
     if refused:
         raise CaseError(refused.values(), more)

@@ -51,12 +51,14 @@ def test_nodes_and_points_are_those_of_the_lattice(size: tuple[float, ...], spac
 
 def test_memory_is_what_was_measured() -> None:
     """Within a fourth, of runs on one rank."""
-    for size, spacing, gamma, measured in [
-        ([500.0, 500.0], 0.8, 1.8, 0.981e9), ([200.0, 200.0], 0.8, 0.5, 0.429e9), ([50.0] * 3, 1.2, 1.8, 0.799e9),
-        ([70.0] * 3, 1.2, 1.8, 1.771e9), ([50.0] * 3, 1.2, 0.5, 3.095e9),
+    for source, size, spacing, gamma, measured in [
+        ("lattice", [500.0, 500.0], 0.8, 1.8, 0.981e9), ("lattice", [200.0, 200.0], 0.8, 0.5, 0.429e9),
+        ("lattice", [50.0] * 3, 1.2, 1.8, 0.799e9), ("lattice", [70.0] * 3, 1.2, 1.8, 1.771e9),
+        ("lattice", [50.0] * 3, 1.2, 0.5, 3.095e9), ("gmsh", [50.0] * 3, 1.2, 1.8, 3.006e9),
+        ("gmsh", [30.0] * 3, 1.2, 1.8, 0.824e9),
     ]:  # fmt: skip
         particles = {"centres": [[0.5 * length for length in size]], "radii": [4.0]}
-        changes = {"domain.size": size, "nodes.spacing": spacing, "shape_functions.gamma": gamma}
+        changes = {"nodes": {"source": source, "spacing": spacing}, "shape_functions.gamma": gamma, "domain.size": size}
         found = need(resolved(altered(changes | {"particles": particles})), 1)
         assert found.memory > 0.95 * measured
         assert found.memory < 1.25 * measured + 0.25e9, "which is the compiler's"
@@ -100,7 +102,7 @@ BOX = {"container": [[0.0, 0.0], [100.0, 60.0]], "source": "packing"}
 )
 def test_a_packing_is_reckoned_before_it_is_drawn(particles: Tree, key: str, value: Any) -> None:
     roomier = Settings(**ROOMY | {"nodes_limit": 10**9, "memory_limit": 10**15})
-    [(pointer, shown, words)] = refused(altered({"particles": BOX | particles, "nodes.spacing": 0.012}), roomier)
+    (pointer, shown, words), *_ = refused(altered({"particles": BOX | particles, "nodes.spacing": 0.012}), roomier)
     assert pointer == f"/case/particles/{key}"
     assert "must be at most" in words
     if value is not None:
@@ -110,9 +112,12 @@ def test_a_packing_is_reckoned_before_it_is_drawn(particles: Tree, key: str, val
 def test_a_sweep_is_bounded_by_the_sum_of_its_cases() -> None:
     base = altered({"particles": {"centres": MANY, "radii": [10.0] * 900}, "domain.size": [1000.0, 1000.0]})
     definition = {"name": "s", "base": base, "axes": {"model.A": {"linspace": [1.0, 2.0, 1000]}}}
-    with pytest.raises(HttpError, match="too large together, up to point") as caught:
+    with pytest.raises(HttpError, match=r"give 1000 cases that take more than 1e\+06 bytes together") as caught:
         sweep_of(SweepSubmission(definition=definition), Settings(**ROOMY, sweep_limit=1_000_000))
     assert caught.value.details.errors[0].pointer == "/definition/axes"
+    names = {**definition, "axes": {"particles.interface_width": {"linspace": [1.0, 2.0, 50]}}}
+    with pytest.raises(HttpError, match=r"give 50 cases that take more than 1e\+05 bytes together"):
+        sweep_of(SweepSubmission(definition=names), Settings(**ROOMY, sweep_limit=100_000))
     few = {**definition, "axes": {"model.A": [1.0, 2.0]}}
     assert len(sweep_of(SweepSubmission(definition=few), Settings(**ROOMY, sweep_limit=1_000_000)).points) == 2
 

@@ -1,5 +1,6 @@
 """Files of strangers: each attack against a real child, what is kept, what is removed, what the ranks read."""
 
+import asyncio
 import base64
 import json
 import os
@@ -18,13 +19,18 @@ import numpy as np
 import pytest
 from asking import TINY, Tree, gmsh_text, service
 from fastapi.testclient import TestClient
+from serving import PAIR, ended, settings
+from serving import submit as submit_to
 
+from frit.service.engine import Engine
+from frit.service.jobs import Job, NewJob, State
 from frit.service.problems import HttpError
 from frit.service.settings import Settings
 from frit.service.sniffing import HDF5, UnknownFileError, kind_of
 from frit.service.uploads import Shelf
 from frit.service.views import FileContent
 from frit.solver import mesh_file
+from frit.solver.case import parse_case
 from frit.solver.geometry import MeshError, file_mesh, lattice
 
 SIZE = (22.0, 13.0)
@@ -349,3 +355,18 @@ def test_ranks_read_of_uploads_only_what_was_converted(tmp_path: Path, monkeypat
     own.write_bytes(own.read_bytes()[:-8])
     with pytest.raises(MeshError, match="damaged"):
         file_mesh(own, SIZE)
+
+
+def test_a_job_that_an_older_index_has_queued_is_refused_by_its_ranks(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "m.msh").write_bytes(MESH)
+    case = parse_case({**PAIR, "nodes": {"source": "file", "path": str(tmp_path / "files" / "m.msh")}})
+
+    async def run() -> Job:
+        async with Engine(settings(tmp_path)) as engine:
+            [job] = await submit_to(engine, NewJob(json.dumps(case.tree()), case.identity(), "old"))
+            return (await ended(engine, job))[0]
+
+    job = asyncio.run(run())
+    assert job.state is State.FAILED
+    assert "was uploaded in a form that is not read any more" in (job.message or "")

@@ -121,7 +121,7 @@ def refused_case(error: CaseError, pointer: str, title: str = "The case is refus
         WrongField(pointer=pointer + pointer_to(problem.key), value=shown(problem.value), detail=problem.allowed)
         for problem in error.problems
     ]
-    return HttpError(422, kind, title, str(error), fields)
+    return HttpError(422, kind, title, str(error), fields, more=error.more)
 
 
 def unavailable(detail: str) -> HttpError:

@@ -650,3 +650,10 @@ def test_a_file_of_wrong_lines_is_told_in_part(tmp_path: Path) -> None:
     with pytest.raises(CaseError, match=r"line 1 has 1 columns") as caught:
         read_csv(tmp_path, "x\n" * 1_000_000)
     assert caught.value.more == 950
+
+
+def test_a_name_is_not_a_text_of_any_length() -> None:
+    tree = tomllib.loads(TWO_DISCS)
+    assert parse_case(tree | {"name": "a" * 10_000}).name == "a" * 10_000
+    with pytest.raises(CaseError, match="must have at most 10000 characters"):
+        parse_case(tree | {"name": "a" * 10_001})

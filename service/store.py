@@ -637,6 +637,14 @@ class Store:
             query = sa.select(history.c.row, history.c.data).where(history.c.job == seq, history.c.row >= since)
             return [(row.row, row.data) for row in connection.execute(query.order_by(history.c.row).limit(limit))]
 
+    def columns(self, seq: int) -> list[str]:
+        """Names of the scalars in the history rows of a job, in the order in which they come."""
+        query = (
+            "SELECT key FROM history, json_each(history.data) WHERE job = ? AND type NOT IN ('array', 'object') "
+            "GROUP BY key ORDER BY min(row), min(json_each.id)"
+        )
+        return [key for (key,) in self._ask(query, (seq,))]
+
     def snapshots(self, identifier: str) -> list[tuple[int, float]]:
         """(number, time) of the complete snapshots."""
         with self.reading() as connection:

@@ -536,7 +536,8 @@ class Store:
     ) -> list[tuple[Job, Any]]:  # fmt: skip
         """Jobs that fit, in order, each with the value it is ordered by.
 
-        The jobs are chosen first and read afterwards: sorting moves numbers, not cases. `few`: parts of the filter, and
+        The jobs are chosen first and read afterwards: sorting moves numbers, not cases; of these, particles that are
+        listed one by one are left out. `few`: parts of the filter, and
         at last all of it, that indices have in another order; so where few jobs fit one they are found by it and
         sorted, and where many do, a walk along the order meets enough of them soon. `near`: the beginning of such a
         walk; where that is not enough, all that fit are sorted.
@@ -554,7 +555,7 @@ class Store:
                 places = connection.execute(chosen.where(where, jobs.c.seq.in_(near))).all()
             if len(places) < limit:
                 places = connection.execute(chosen.where(where)).all()
-            rows = connection.execute(sa.select(jobs).where(jobs.c.seq.in_([seq for seq, _ in places])))
+            rows = connection.execute(sa.select(*BRIEF).where(jobs.c.seq.in_([seq for seq, _ in places])))
             records = {row.seq: _record(row) for row in rows}
         return [(records[seq], at) for seq, at in places]
 
@@ -849,6 +850,9 @@ def _all_with(t: Transaction, column: str, values: Sequence[Any]) -> list[Job]:
 
 NAMES = [column.name for column in jobs.c]
 COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
+LISTS = ("$.particles.centres", "$.particles.radii", "$.particles.sizes")  # most of a large case
+WITHOUT = sa.func.json_remove(jobs.c.case, *LISTS).label("case")
+BRIEF = [WITHOUT if column.name == "case" else column for column in jobs.c]
 
 
 def _unpacked(values: dict[str, Any]) -> Job:

@@ -615,6 +615,16 @@ def test_points_of_the_same_case_share_a_job(store: Store) -> None:
     assert len(store.jobs()) == 2
 
 
+def test_a_page_moves_no_lists_of_particles(store: Store) -> None:
+    """Five hundred cases of megabytes each would be in memory at once."""
+    particles = {"centres": [[1.0, 2.0]] * 9, "radii": [1.0] * 9, "sizes": [], "shape": "ball"}
+    case = json.dumps({"name": "e\u00e9", "particles": particles, "time": {"end": 1e-7, "step": None}})
+    whole = done(store.submit(new(1, case=case)))
+    ((job, _),) = store.page(sa.true(), [table.c.seq], 2)
+    assert json.loads(job.case) == json.loads(case) | {"particles": {"shape": "ball"}}
+    assert store.job(whole.id).case == case
+
+
 def test_sweeps_come_newest_first_in_pages(store: Store) -> None:
     for k in range(5):
         done(store.submit_sweep(f"n{k}", "{}", []))

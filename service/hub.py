@@ -34,7 +34,8 @@ class Hub:
         if seen is not None and seen != self.count:
             return True
         try:
-            await asyncio.wait_for(self._changed.wait(), seconds)
+            async with asyncio.timeout(seconds):  # `wait_for` of Python 3.11 may lose a cancellation
+                await self._changed.wait()
         except TimeoutError:
             return False
         return True

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from indexing import done, new, opened
 
 from frit.service.hub import Hub
@@ -59,3 +60,26 @@ def test_a_hundred_followers_leave_the_loop_to_others(tmp_path: Path) -> None:
         longest, came = asyncio.run(longest_wait(store, tmp_path, job.id, 100))
     assert longest < 20 * LOOK  # were all looks taken at once: 100
     assert came > 10
+
+
+@pytest.mark.parametrize("passes", range(6))
+def test_a_follower_that_is_woken_and_cancelled_at_once_ends(passes: int) -> None:
+    async def try_it() -> bool:
+        hub = Hub()
+
+        async def follow() -> None:
+            while True:
+                await hub.wait(60.0)
+
+        task = asyncio.create_task(follow())
+        await asyncio.sleep(0.01)
+        hub.notify()
+        for _ in range(passes):
+            await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.wait([task], timeout=0.5)
+        ended = task.cancelled()
+        task.cancel()
+        return ended
+
+    assert asyncio.run(try_it())

@@ -174,6 +174,7 @@ def test_only_the_beginning_of_a_large_value_is_written_out() -> None:
 
 
 RED = "\x1b[31mRED"
+NO_TEXT = "must have no control characters|must be a valid string"  # half a surrogate pair is no text at all
 
 
 @pytest.mark.parametrize("bad", [RED, "a\nb", "\x9b31m", "\u202egnp.exe", "a\u2028b", "\x00", "\x7f", "\ud800"])
@@ -189,9 +190,9 @@ def test_no_string_that_is_shown_has_control_characters(client: TestClient, bad:
         assert not unshowable_in(answer)
     for changes in ({"name": bad}, {"tags": [bad]}, {"axes": {bad: [1]}}, {"axes": {"particles.path": [bad]}}):
         refusal(client, {"definition": {**SWEEP, **changes}}, "/v1/sweeps")
-    with pytest.raises(CaseError, match="control characters"):
+    with pytest.raises(CaseError, match=NO_TEXT):
         parse_case({**TINY, "name": bad})
-    with pytest.raises(CaseError, match="control characters"):
+    with pytest.raises(CaseError, match=NO_TEXT):
         parse_sweep({**SWEEP, "name": bad})
 
 

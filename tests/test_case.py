@@ -667,7 +667,7 @@ def test_only_the_beginning_of_a_refused_value_is_written_out() -> None:
 
 @pytest.mark.parametrize("text", ["\x1b[31mRED", "a\nb", "\x9b", "\u202e", "\u2028", "\ud800"])
 def test_a_name_has_no_control_characters(text: str) -> None:
-    with pytest.raises(CaseError, match=r"name = .*: must have no control characters"):
+    with pytest.raises(CaseError, match=r"name = .*: must (have no control characters|be a valid string)"):
         parse_case({**minimal(), "name": text})
 
 

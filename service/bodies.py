@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from fastapi import Request, Response
 from fastapi.routing import APIRoute
+from starlette.requests import ClientDisconnect
 
 from frit.solver.characters import UNSHOWABLE
 
@@ -146,6 +147,8 @@ class LimitedRequest(Request):
         except TimeoutError:
             detail = f"the body must come within {ARRIVAL:g} s"
             raise HttpError(408, "request-timeout", "The body did not come", detail) from None
+        except ClientDisconnect:  # nobody hears it
+            raise HttpError(400, "disconnected", "The body did not come", "the client has hung up") from None
         if not body:
             return
         self._tree = parsed(body, most) if len(body) < SMALL else await asyncio.to_thread(parsed, body, most)

@@ -95,6 +95,19 @@ def test_a_stranger_without_a_length_is_hung_up_on(url: str) -> None:
     assert answer.startswith(b"HTTP/1.1 401 ")
 
 
+def test_a_client_that_hangs_up_in_its_body_is_no_error(
+    url: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    secret = tokens.create(tmp_path, "you", "submit")
+    head = f"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {secret}\r\nContent-Type: application/json\r\n"
+    with closing(socket.create_connection(place(url), timeout=30)) as connection:
+        connection.sendall(f"{head}Content-Length: 1000\r\n\r\n{{".encode())
+        time.sleep(0.3)
+    time.sleep(0.5)
+    assert alive(url)
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_more_connections_than_are_allowed_are_turned_away_and_come_again(url: str) -> None:
     with ExitStack() as stack:
         for _ in range(25):

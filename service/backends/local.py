@@ -127,7 +127,8 @@ class LocalBackend:
         if runner is not None and (process := opened_again(runner)) is not None:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(process, signal.SIGKILL)
-            os.close(process)
+            if (process := await gone(process, CLEARING)) is not None:
+                os.close(process)
         loop = asyncio.get_running_loop()
         deadline = loop.time() + CLEARING
         while await asyncio.to_thread(kill_marked, run_mark(directory)) and loop.time() < deadline:

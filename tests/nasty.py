@@ -292,7 +292,7 @@ def wrong_lists(r: random.Random) -> Nasty:
 
 def sweeps(r: random.Random) -> Nasty:
     """Products without end, axes that are none, points that cannot be."""
-    n = r.choice([1, 3, 1000, 50_000])
+    n = r.choice([1, 3, 300, 3000])
     axes = r.choice(
         [
             {"time.end": {"linspace": [0.001, 0.002, 10**9]}},

@@ -102,10 +102,3 @@ FIXED: dict[str, Any] = {
 @settings(max_examples=10, **FIXED)
 def test_every_answer_is_one_that_the_document_has(case: schemathesis.Case[Any], url: str) -> None:
     answered(case, url)
-
-
-@pytest.mark.slow
-@schema.parametrize()
-@settings(max_examples=60, **FIXED)
-def test_every_answer_of_very_many_is(case: schemathesis.Case[Any], url: str) -> None:
-    answered(case, url)

@@ -75,10 +75,10 @@ class HttpError(Exception):
         headers: Mapping[str, str] | None = None, state: str | None = None, more: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(detail)
-        told = [short(field) for field in errors]
+        fields = list(errors)
         self.details = ProblemDetails(
             type=f"/problems/{kind}", title=title, status=status, detail=cut(detail), state=state,
-            errors=told[:MOST_ERRORS], more=more + len(told[MOST_ERRORS:]),
+            errors=[short(field) for field in fields[:MOST_ERRORS]], more=more + len(fields[MOST_ERRORS:]),
         )  # fmt: skip
         self.headers = dict(headers or {})
 
@@ -109,8 +109,8 @@ def short(field: WrongField) -> WrongField:
 
 def refused(kind: str, title: str, fields: Sequence[WrongField], status: int = 422, more: int = 0) -> HttpError:
     """A request with wrong fields."""
-    fields = [short(field) for field in fields[:MOST_ERRORS]]
-    places = (f"{field.parameter or field.pointer or 'body'}: {field.detail}" for field in fields)
+    told = map(short, fields[:MOST_ERRORS])
+    places = (f"{field.parameter or field.pointer or 'body'}: {field.detail}" for field in told)
     return HttpError(status, kind, title, "; ".join(places), fields, more=more)
 
 

@@ -126,6 +126,12 @@ def test_many_wrong_fields_are_counted_not_told(client: TestClient) -> None:
     assert problem["more"] == 900 - MOST_ERRORS
 
 
+def test_wrong_paths_beyond_the_told_ones_are_counted(client: TestClient) -> None:
+    sweep = {**SWEEP, "axes": {"nodes.path": [f"mesh {k}" for k in range(80)]}}
+    problem = refusal(client, {"definition": sweep}, "/v1/sweeps")
+    assert (len(problem["errors"]), problem["more"]) == (MOST_ERRORS, 80 - MOST_ERRORS)
+
+
 @pytest.mark.parametrize("place", ["", "case", "nodes"])
 def test_an_object_of_very_many_keys_is_one_error(client: TestClient, place: str) -> None:
     many = {f"key {k}": k for k in range(5000)}

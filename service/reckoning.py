@@ -18,6 +18,7 @@ from typing import Any
 
 from frit.solver import amounts
 from frit.solver.mesh_file import MeshFileError, shapes
+from frit.sweeps.cost import nodes_in_range
 
 from .settings import Settings
 
@@ -66,7 +67,7 @@ def need(case: Tree, ranks: int) -> Need:
     snapshots = snapshots_of(output["snapshots"], end)
     shared = case["activation"]["few_order_parameters"]
     slots = min(particles, MANY_SLOTS[dim]) if shared else particles
-    pairs = points * in_range(case["shape_functions"], dim)
+    pairs = points * nodes_in_range(case)
     memory = nodes * (NODE + SLOT * max(slots - SLOTS, 0)) + pairs * PAIR[case["nodes"]["source"]]
     checkpoint = nodes * (16 + 24 * max(slots, SLOTS))
     disk = (ROW + ROW_PARTICLE * particles) * rows + SNAPSHOT * nodes * snapshots + 2 * checkpoint + MESH * nodes
@@ -99,14 +100,6 @@ def particles_of(given: Tree) -> float:
 def snapshots_of(given: Any, end: float) -> float:
     """How many a run writes."""
     return amounts.times(end, given["every"]) if isinstance(given, Mapping) else float(len(given))
-
-
-def in_range(shape: Tree, dim: int) -> float:
-    """Nodes within h sqrt(-ln(delta_0) / gamma) of a point; the corners of its cell with linear functions."""
-    if shape["kind"] == "linear":
-        return dim + 1.0
-    reach = math.sqrt(-math.log(shape["tolerance"]) / shape["gamma"])
-    return math.pi * reach**2 * 2 / math.sqrt(3) if dim == 2 else 4 / 3 * math.pi * reach**3 * 0.75 * math.sqrt(3)
 
 
 # --- too much

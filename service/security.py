@@ -76,7 +76,7 @@ class Door:
         """`active`: the tokens that count now. Raises `OSError`, `StoreError`."""
         if not self._open or is_marked(self._folder):
             self._open = False
-        elif active or not (self._asked or not store.had_tokens()):
+        elif active or (not self._asked and store.had_tokens()):
             set_mark(self._folder)  # tokens were made by a frit that knew no mark
             self._open = False
         self._asked = True

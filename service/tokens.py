@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from . import migrations
-from .files import flush_folder, make_private
+from .files import make_private, write_whole
 from .store import BUSY, NotFoundError, StoreError, Token
 
 SCOPES = ("read", "submit", "admin")  # each allows all that the ones before allow
@@ -43,11 +43,7 @@ def set_mark(folder: Path) -> None:
     """Make the mark durable, before the first token is."""
     if not is_marked(folder):
         make_private(folder)
-        with open(folder / MARK, "w", encoding="utf-8") as file:
-            file.write("This folder has or had access tokens: frit serves it only to who brings one.\n")
-            file.flush()
-            os.fsync(file.fileno())
-        flush_folder(folder)
+        write_whole(folder / MARK, b"This folder has or had access tokens: frit serves it only to who brings one.\n")
 
 
 def create(folder: Path, name: str, scope: str) -> str:

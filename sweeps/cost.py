@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from frit.solver import amounts
 from frit.solver.arrays import Floats
 
 from .expand import Expansion
@@ -74,7 +75,7 @@ def work(case: Case) -> Work:
     h, size = _spacing(case), case["domain"]["size"]
     in_cell = 4 / sqrt(3) if len(size) == 2 else 4.5 * sqrt(3)  # points per h^dim of the built-in lattices
     rows = case["time"]["end"] / case["output"]["history_every"]
-    return Work(in_cell * prod(size) / h ** len(size), _nodes(case), _live(case), evaluations(case), rows)
+    return Work(in_cell * prod(size) / h ** len(size), nodes_in_range(case), _live(case), evaluations(case), rows)
 
 
 def evaluations(case: Case) -> float:
@@ -85,7 +86,7 @@ def evaluations(case: Case) -> float:
     """
     time, model, h = case["time"], case["model"], _spacing(case)
     if time["integrator"] == "rk2":
-        step = time.get("step") or 0.1 * h**2 / (2 * model["L"] * model["kappa_eta"])
+        step = time.get("step") or amounts.paper_step(h, model["L"], model["kappa_eta"])
         return 2.0 * ceil(float(time["end"] / step))
     others = max(_particles(case["particles"], len(case["domain"]["size"])) - 1, 0)
     rigid = CONTACTS * sqrt(others) if model["rigid_motion"] else 0.0
@@ -110,7 +111,7 @@ def _spacing(case: Case) -> float:
     return float(case["nodes"].get("spacing") or min(case["domain"]["size"]) / 50)
 
 
-def _nodes(case: Case) -> float:
+def nodes_in_range(case: Case) -> float:
     """Nodes within h sqrt(-ln(delta_0) / gamma) of a point; the corners of a cell with linear functions."""
     dim, reach = len(case["domain"]["size"]), _reach(case["shape_functions"])
     if case["shape_functions"]["kind"] == "linear":

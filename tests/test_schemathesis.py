@@ -81,8 +81,12 @@ def is_file(content: Any) -> bool:
     return known and isinstance(content.get("content"), str) and content.get("encoding", "text") in ("text", "base64")
 
 
-def answered(case: schemathesis.Case[Any], url: str) -> None:
-    """Sent as the one who may do all; the answer must be one that the document has."""
+@schema.parametrize()
+@settings(
+    max_examples=10, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate],
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+def test_every_answer_is_one_that_the_document_has(case: schemathesis.Case[Any], url: str) -> None:
     # not ready is an answer, and nothing is started here
     excluded: list[Any] = [not_a_server_error] if case.operation.path == "/readyz" else []
     headers = {"Authorization": f"Bearer {Known.secret}"}
@@ -90,15 +94,3 @@ def answered(case: schemathesis.Case[Any], url: str) -> None:
     if re.fullmatch("[!-~]{1,255}", key):  # one of an earlier request would be refused with this one
         headers["Idempotency-Key"] = str(uuid4())
     case.call_and_validate(base_url=url, headers=headers, excluded_checks=excluded)
-
-
-FIXED: dict[str, Any] = {
-    "deadline": None, "derandomize": True, "phases": [Phase.explicit, Phase.generate],
-    "suppress_health_check": list(HealthCheck),
-}  # fmt: skip
-
-
-@schema.parametrize()
-@settings(max_examples=10, **FIXED)
-def test_every_answer_is_one_that_the_document_has(case: schemathesis.Case[Any], url: str) -> None:
-    answered(case, url)

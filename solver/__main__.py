@@ -20,22 +20,20 @@ from typing import Any
 
 import numpy as np
 
-from . import checkpoint, output, slots
+from . import checkpoint, output
 from .arrays import Floats
 from .case import Case, CaseError, load_case
-from .checkpoint import Checkpoint, CheckpointError
+from .checkpoint import CheckpointError
 from .failure import comes_again, told
-from .geometry import Mesh, MeshError
+from .geometry import MeshError
 from .integrators import Integrator
-from .observe import Observables
 from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
-from .prepare import build_mesh, make_integrator, prepare
 from .run import Ending, RunError, piled_up, run
-from .scheme import Scheme
+from .setup import Setup, make_setup
 from .shape import ShapeError
-from .state import State
+from .system import Progress, System
 
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
@@ -106,16 +104,16 @@ def execute(
         return "interrupted", "while the particles were packed: nothing is kept yet"
     case, packing = placed
     rows = fresh or ranks.from_root(checkpoint.by_rows(directory) if ranks.root else None)
-    mesh, identity = build_mesh(case, ranks, rows), asked.identity()
-    kept = None if fresh else ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
-    scheme, state, integrator = start(case, mesh, ranks, kept)
+    setup, identity = make_setup(case, ranks, rows), asked.identity()
+    kept = None if fresh else setup.read(directory, identity)
+    scheme, state, integrator = setup.start(kept)
     if ranks.root:
         record_start(directory, asked, ranks.size, fresh, packing)
         if fresh and arguments.resume is not None:
             record_note(directory, ANEW)
     while True:
         wall_time = kept.wall_time if kept else None
-        recorder = Recorder(directory, mesh, scheme, state, identity, wall_time, requests, arguments.progress)
+        recorder = Recorder(directory, setup, scheme, state, identity, wall_time, requests, arguments.progress)
         try:
             ending = run(scheme, state, integrator, recorder)
             recorder.checkpoint(scheme, state, integrator)
@@ -129,21 +127,8 @@ def execute(
             return "interrupted", f"checkpoint at t = {state.time:.6g}"
         del scheme, state, recorder  # the mesh is divided anew: the run goes on from the checkpoint
         ranks.watch.enter("set-up")
-        kept = ranks.from_root(checkpoint.read(directory, identity, mesh) if ranks.root else None)
-        scheme, state, integrator = start(case, mesh, ranks, kept)
-
-
-def start(case: Case, mesh: Mesh, ranks: Ranks, kept: Checkpoint | None) -> tuple[Scheme, State, Integrator]:
-    """Scheme, state and integrator of a fresh run, or of one that goes on from a checkpoint. Collective."""
-    scheme, state = prepare(case, mesh, ranks, kept.reference if kept else None)
-    if kept:
-        nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
-        state.u[:], _ = slots.repack(
-            kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1]
-        )
-        if kept.motion is not None:
-            scheme.motion = kept.motion
-    return scheme, state, make_integrator(case, mesh, kept.memory if kept else None)
+        kept = setup.read(directory, identity)
+        scheme, state, integrator = setup.start(kept)
 
 
 def place_or_stop(
@@ -186,61 +171,61 @@ class Recorder:
     def __init__(
         self,
         directory: Path,
-        mesh: Mesh,
-        scheme: Scheme,
-        state: State,
+        setup: Setup,
+        system: System,
+        state: Progress,
         identity: str,
         wall_time: float | None,
         requests: Requests,
         progress: bool,
     ) -> None:
         """identity: of the case as asked; wall_time: seconds that a resumed run has taken before, None: a fresh run."""
-        case, self.ranks, self.identity = scheme.d.case, scheme.d.share.ranks, identity
+        case, self.ranks, self.identity = system.case, system.ranks, identity
         fresh = wall_time is None
-        self.directory, self.mesh, self.requests, self.progress = directory, mesh, requests, progress
+        self.directory, self.setup, self.requests, self.progress = directory, setup, requests, progress
         self.began = time.monotonic() - (wall_time or 0.0)
-        self.collector = Collector(scheme.d.share, output.block_size(directory, len(mesh.nodes), self.ranks, fresh))
-        self.observables = Observables(case, mesh, scheme.d, len(state.slot_of))
+        self.collector = Collector(setup.share(system), output.block_size(directory, setup.nodes, self.ranks, fresh))
+        self.observables = setup.rows(system, state)
         self.rows = output.History(directory, state.time if state.step else None) if self.ranks.root else None
-        self.snapshots = output.Snapshots(directory, case, mesh, self.collector, fresh)
+        self.snapshots = output.Snapshots(directory, case, setup.positions, self.collector, fresh)
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
         self.latest: dict[str, Any] = {}  # history row
         self.noted = False  # that a particle is pressed against a wall
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
 
-    def history(self, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
+    def history(self, system: System, state: Progress, u: Floats, time_: float) -> None:
         """Append a row."""
-        if not self.noted and (note := piled_up(scheme, state)):
+        if not self.noted and (note := piled_up(system, state)):
             self.noted = True
             if self.ranks.root:
                 record_note(self.directory, note)
-        row = self.observables.row(scheme, state, u, time_, self._wall_time())
+        row = self.observables.row(system, state, u, time_, self._wall_time())
         self.latest = row
         if self.rows is not None:
             self.rows.append(row)
 
-    def snapshot(self, number: int, scheme: Scheme, state: State, u: Floats, time_: float) -> None:
+    def snapshot(self, number: int, system: System, state: Progress, u: Floats, time_: float) -> None:
         """Write a snapshot."""
-        self.snapshots.write(number, time_, state, u)
+        self.snapshots.write(number, time_, *self.setup.nodal(system, state, u))
 
-    def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
+    def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
         """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
-        due = time.monotonic() - self.checkpoint_clock >= scheme.d.case.output.checkpoint_every
+        due = time.monotonic() - self.checkpoint_clock >= system.case.output.checkpoint_every
         wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
         due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
-        self._show(scheme, state)
+        self._show(system, state)
         if (due or asked) and not stop:
-            self.checkpoint(scheme, state, integrator)
+            self.checkpoint(system, state, integrator)
         return bool(stop)
 
-    def checkpoint(self, scheme: Scheme, state: State, integrator: Integrator) -> None:
+    def checkpoint(self, system: System, state: Progress, integrator: Integrator) -> None:
         """Make the state durable, and the rows before it."""
         if self.rows is not None:
             self.rows.sync()
         notes = {
             "identity": self.identity, "memory": integrator.memory, "wall_time": self._wall_time(),
         }  # fmt: skip
-        checkpoint.write(self.directory, scheme, state, self.collector, self.mesh, notes)
+        self.setup.keep(self.directory, system, state, self.collector, notes)
         self.checkpoint_time, self.checkpoint_clock = state.time, time.monotonic()
         self.requests.checkpoint = False
 
@@ -252,14 +237,14 @@ class Recorder:
     def _wall_time(self) -> float:
         return time.monotonic() - self.began
 
-    def _show(self, scheme: Scheme, state: State) -> None:
+    def _show(self, system: System, state: Progress) -> None:
         """Print a progress line, at most four a second."""
         clock = time.monotonic()
         if not (self.progress and self.ranks.root) or clock - self.shown < PROGRESS_EVERY:
             return
         self.shown = clock
         began, time_0, evaluations_0 = self.started
-        elapsed, end = max(clock - began, 1e-9), scheme.d.case.time.end
+        elapsed, end = max(clock - began, 1e-9), system.case.time.end
         speed = (state.time - time_0) / elapsed
         line = {
             "time": state.time, "end": end, "step": state.step, "evaluations": state.evaluations,

@@ -254,13 +254,16 @@ class Nodes(Table):
     """Where the mesh of nodes and material points comes from."""
 
     switches: ClassVar = ("source",)
-    owned: ClassVar = {("lattice",): {"spacing": ...}, ("gmsh",): {"spacing": ...}, ("file",): {"path": ...}}
+    owned: ClassVar = {
+        ("lattice",): {"spacing": ...}, ("triangular",): {"spacing": ...}, ("gmsh",): {"spacing": ...},
+        ("file",): {"path": ...},
+    }  # fmt: skip
     alone: ClassVar = ("spacing",)
 
-    source: Literal["lattice", "gmsh", "file"] = "lattice"
-    """lattice: triangular or body-centred, built in; gmsh: meshed by gmsh; file: read by meshio"""
+    source: Literal["lattice", "triangular", "gmsh", "file"] = "lattice"
+    """lattice: square or cubic; triangular: body-centred in 3-D; gmsh: meshed by gmsh; file: read by meshio"""
     spacing: Positive | None = None
-    """h, nm: nodal spacing (lattice, gmsh)"""
+    """h, nm: nodal spacing (lattice, triangular, gmsh)"""
     path: Text | None = None
     """mesh of triangles or tetrahedra; relative to the case file (file)"""
 

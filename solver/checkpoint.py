@@ -15,6 +15,7 @@ from .geometry import Mesh
 from .partition import Collector
 from .scheme import Scheme
 from .state import State
+from .system import Progress
 
 NAME = "checkpoint.h5"
 FORMAT = 3
@@ -43,10 +44,7 @@ class Checkpoint:
 def write(
     directory: Path, scheme: Scheme, state: State, collector: Collector, mesh: Mesh, notes: dict[str, Any]
 ) -> None:
-    """Collective; rank 0 writes beside the old file, makes it durable, and renames.
-
-    notes: identity, memory, wall_time.
-    """
+    """Collective; rank 0 writes. notes: identity, memory, wall_time."""
     fields = {
         "u": collector.whole(state.u),
         "owner": collector.whole(state.owner),
@@ -56,14 +54,20 @@ def write(
     if not scheme.d.share.ranks.root:
         return
     fields |= {"slot_of": state.slot_of, "reference_slot_of": scheme.before.slot_of, "motion": scheme.carried}
+    store(directory, fields, state, len(mesh.nodes), mesh_hash(mesh), notes)
+
+
+def store(
+    directory: Path, fields: dict[str, Any], state: Progress, nodes: int, mesh: str, notes: dict[str, Any]
+) -> None:
+    """Write beside the old file, make it durable, and rename. mesh: a fingerprint of what the fields stand on."""
     beside = directory / (NAME + ".new")
     try:
         with h5py.File(beside, "w") as file:
             for name, values in fields.items():
                 file[name] = values
-            file["u"].attrs["columns"] = "rho, then slots of eta; owner[:, s] is the particle of column 1 + s, -1: none"
             file.attrs.update(format=FORMAT, time=state.time, step=state.step, evaluations=state.evaluations)
-            file.attrs.update(nodes=len(mesh.nodes), mesh=mesh_hash(mesh), notes=json.dumps(notes))
+            file.attrs.update(nodes=nodes, mesh=mesh, notes=json.dumps(notes))
     except (KeyError, RuntimeError, ValueError) as error:  # HDF5's words for a disk that is full, among others
         raise OSError(f"{NAME} could not be written: {error}") from error
     replace_durably(beside, directory / NAME)
@@ -71,6 +75,17 @@ def write(
 
 def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
     """The checkpoint of a run directory; CheckpointError where it belongs to another case or mesh."""
+    values, counts, notes = load(directory, identity, len(mesh.nodes), mesh_hash(mesh))
+    state = State(*counts, values["u"], values["owner"], values["slot_of"])
+    chosen_from = [values.get(f"reference_{name}", values[name]) for name in ("owner", "slot_of")]
+    reference = State(*counts, values["reference"], *chosen_from)
+    return Checkpoint(state, reference, notes["memory"], values.get("motion"), notes["wall_time"])
+
+
+def load(
+    directory: Path, identity: str, nodes: int, mesh: str
+) -> tuple[dict[str, Any], tuple[float, int, int], dict[str, Any]]:
+    """What `store` has written: fields; time, step and evaluations; notes. Raises `CheckpointError`."""
     path = directory / NAME
     try:
         with h5py.File(path) as file:
@@ -83,14 +98,10 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
     notes = json.loads(attributes["notes"])
     if notes["identity"] != identity:
         raise CheckpointError(f"{path}: belongs to another case than case.json")
-    if attributes["mesh"] != mesh_hash(mesh):
+    if attributes["mesh"] != mesh:
         then = attributes["nodes"]
-        raise CheckpointError(f"{path}: the mesh has changed since: {then} nodes then, {len(mesh.nodes)} now")
-    counts = float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])
-    state = State(*counts, values["u"], values["owner"], values["slot_of"])
-    chosen_from = [values.get(f"reference_{name}", values[name]) for name in ("owner", "slot_of")]
-    reference = State(*counts, values["reference"], *chosen_from)
-    return Checkpoint(state, reference, notes["memory"], values.get("motion"), notes["wall_time"])
+        raise CheckpointError(f"{path}: the mesh has changed since: {then} nodes then, {nodes} now")
+    return values, (float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])), notes
 
 
 def by_rows(directory: Path) -> bool:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +55,9 @@ def make_mesh(nodes: "Nodes", size: Sequence[float], rows: bool = True) -> Mesh:
     if nodes.source == "file" and nodes.path is not None:
         return file_mesh(nodes.path, size)
     if nodes.source != "file" and nodes.spacing is not None:
-        return lattice(size, nodes.spacing, rows) if nodes.source == "lattice" else gmsh_mesh(size, nodes.spacing)
+        if nodes.source == "gmsh":
+            return gmsh_mesh(size, nodes.spacing)
+        return (square if nodes.source == "lattice" else lattice)(size, nodes.spacing, rows)
     raise MeshError(f"nodes: source {nodes.source}, spacing {nodes.spacing}, path {nodes.path}: one missing")
 
 
@@ -71,6 +74,25 @@ def lattice(size: Sequence[float], spacing: float, rows: bool = True) -> Mesh:
     if 2 * math.prod(n + 2 for n in counts) > np.iinfo(np.int32).max:
         raise MeshError(f"spacing {spacing} in a box of {box}: too many nodes for 32-bit node numbers")
     return _build(*(_triangular if len(box) == 2 else _body_centred)(box, counts), spacing, rows)
+
+
+def square(size: Sequence[float], spacing: float, rows: bool = True) -> Mesh:
+    """Square (2-D) or cubic (3-D) nodes, each cell cut into 2 triangles or 6 tetrahedra: for linear functions."""
+    box = _checked_box(size, spacing)
+    counts = [max(1, round(length / spacing)) for length in box]
+    if 6 * math.prod(n + 1 for n in counts) > np.iinfo(np.int32).max:
+        raise MeshError(f"spacing {spacing} in a box of {box}: too many nodes for 32-bit node numbers")
+    grid = np.meshgrid(*(np.linspace(0.0, length, n + 1) for length, n in zip(box, counts, strict=True)), indexing="ij")
+    number = np.arange(grid[0].size, dtype=np.int32).reshape(grid[0].shape)
+    cells = []
+    for order in permutations(range(len(box))):  # from corner to corner of a cell, one axis after the other
+        corner, path = np.zeros(len(box), dtype=int), []
+        for axis in (None, *order):
+            corner[list(() if axis is None else (axis,))] = 1
+            path.append(number[tuple(slice(c, n + c) for c, n in zip(corner, counts, strict=True))].ravel())
+        cells.append(np.stack(path, axis=-1))
+    nodes = np.stack(grid, axis=-1).reshape(-1, len(box))
+    return _build(nodes, np.concatenate(cells), spacing, rows)
 
 
 def _checked_box(size: Sequence[float], spacing: float) -> tuple[float, ...]:

@@ -1,6 +1,6 @@
 """Steps in time: `rk2` as the paper prints it, and `adaptive`, a stabilised Runge-Kutta-Chebyshev method.
 
-An integrator sees the problem only through `Scheme.rates`, a function of vectors (`unknowns`). It owns its work arrays;
+An integrator sees the problem only through `System.rates`, a function of vectors (`unknowns`). It owns its work arrays;
 `memory` holds what a checkpoint needs so that a resumed run takes the same steps.
 """
 
@@ -9,12 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from . import amounts, unknowns, vectors
+from . import amounts, vectors
 from .arrays import Floats
 from .case import Case
 from .partition import Ranks
-from .scheme import Scheme
-from .state import State
+from .system import Progress, System
 
 
 class Integrator(Protocol):
@@ -23,13 +22,13 @@ class Integrator(Protocol):
     stops_at_events: bool  # whether a step must end at each output time, or `at` interpolates
     y: Floats  # the state's unknowns
 
-    def step(self, scheme: Scheme, state: State, limit: float) -> None:
+    def step(self, system: System, state: Progress, limit: float) -> None:
         """Advance the state by one step, not beyond `limit`."""
 
-    def at(self, scheme: Scheme, state: State, time: float) -> Floats:
+    def at(self, system: System, state: Progress, time: float) -> Floats:
         """The fields (n, F) at a time within the last step."""
 
-    def restart(self, scheme: Scheme, state: State) -> None:
+    def restart(self, system: System, state: Progress) -> None:
         """The set of live points or the layout of the slots has changed."""
 
     @property
@@ -61,26 +60,26 @@ class RK2:
         self.dt = dt
         self.y = self.rate = np.empty(0)
 
-    def step(self, scheme: Scheme, state: State, limit: float) -> None:
+    def step(self, system: System, state: Progress, limit: float) -> None:
         """One step of the equal steps, at most dt, that lead to the limit."""
         remaining = limit - state.time
         count = max(1, ceil(remaining / self.dt - 1e-9))
         dt = remaining / count
         for _ in range(2):
-            scheme.rates(self.y, self.rate)
+            system.rates(self.y, self.rate)
             vectors.advance(self.y, self.y, 0.5 * dt, self.rate)
-        scheme.active.unknowns.put(state.u, self.y)
+        system.keep(state, self.y)
         state.evaluations += 2
         state.time = limit if count == 1 else state.time + dt
         state.step += 1
 
-    def at(self, scheme: Scheme, state: State, time: float) -> Floats:
+    def at(self, system: System, state: Progress, time: float) -> Floats:
         """Every output time ends a step: the fields themselves."""
-        return state.u
+        return system.at(state, self.y)
 
-    def restart(self, scheme: Scheme, state: State) -> None:
+    def restart(self, system: System, state: Progress) -> None:
         """Go on from the state's fields."""
-        self.y = scheme.active.unknowns.take(state.u)
+        self.y = system.vector(state)
         self.rate = np.empty_like(self.y)
 
     @property
@@ -113,7 +112,7 @@ class Chebyshev:
     stops_at_events = False
 
     def __init__(self, tolerance: float, tau: float, memory: dict[str, float] | None = None) -> None:
-        """tau: shortest time in which contacts may relax, see `Scheme.rates`."""
+        """tau: shortest time in which contacts may relax, see `System.rates`."""
         self.tolerance, self.least_tau = tolerance, tau
         kept = memory or {}
         self.repeats = kept.get("fresh", 0.0) > 0.0  # the first rate was known, and counted, before the checkpoint
@@ -136,47 +135,47 @@ class Chebyshev:
             "error_before": self.error_before, "dt_before": self.dt_before, "fresh": float(self.fresh),
         }  # fmt: skip
 
-    def restart(self, scheme: Scheme, state: State) -> None:
+    def restart(self, system: System, state: Progress) -> None:
         """Go on from the state's fields; rates known before hold no more."""
-        self.y = scheme.active.unknowns.take(state.u)
+        self.y = system.vector(state)
         self.old, self.rate_0, self.rate_1, *self.work = (np.zeros_like(self.y) for _ in range(5))
         self.fresh = False
 
-    def step(self, scheme: Scheme, state: State, limit: float) -> None:
+    def step(self, system: System, state: Progress, limit: float) -> None:
         """Try steps until one is accepted."""
         self.old, self.y = self.y, self.old
         if self.fresh:
             self.rate_0, self.rate_1 = self.rate_1, self.rate_0
         else:
-            scheme.rates(self.old, self.rate_0, self.tau)
+            system.rates(self.old, self.rate_0, self.tau)
             state.evaluations += 0 if self.repeats else 1
         self.repeats = False
         if self.radius == 0.0 or self.age >= ESTIMATE_EVERY:
-            self._estimate(scheme, state)
+            self._estimate(system, state)
         if self.dt == 0.0:
             self.dt = 0.1 / self.radius
-        relax, rejected = scheme.relax, False
+        relax, rejected = system.relax, False
         while True:
             dt = self._fit(limit - state.time)
-            error = self._try(scheme, state, dt)
+            error = self._try(system, state, dt)
             if error <= 1.0:
                 break
-            scheme.relax = relax
+            system.relax = relax
             self.dt = dt * max(SHRINK, SAFETY * error ** (-1.0 / 3.0)) if np.isfinite(error) else 0.1 * dt
             if rejected:  # twice in a row: perhaps the step was not stable
-                self._estimate(scheme, state)
+                self._estimate(system, state)
             rejected = True
             if not self.dt > 1e-12 * max(limit, 1.0):
                 raise FloatingPointError(f"step size fell to {self.dt:.1e} at t = {state.time:.6g}")
-        scheme.active.unknowns.put(state.u, self.y)
+        system.keep(state, self.y)
         self._accept(state, dt, error, limit)
 
-    def at(self, scheme: Scheme, state: State, time: float) -> Floats:
+    def at(self, system: System, state: Progress, time: float) -> Floats:
         """The cubic Hermite interpolant of the last step: of higher order than the method."""
         dt = state.time - self.start
         theta = (time - self.start) / dt
         vectors.hermite(self.work[0], self.old, self.rate_0, self.y, self.rate_1, dt, theta)
-        return scheme.active.unknowns.put(state.u.copy(), self.work[0])
+        return system.at(state, self.work[0])
 
     def _fit(self, remaining: float) -> float:
         """The next step: at most what `MOST_STAGES` can do, and no sliver left before the limit."""
@@ -185,7 +184,7 @@ class Chebyshev:
             return remaining
         return min(dt, 0.5 * remaining) if dt > 0.5 * remaining else dt
 
-    def _try(self, scheme: Scheme, state: State, dt: float) -> float:
+    def _try(self, system: System, state: Progress, dt: float) -> float:
         """Fill y with the new fields and rate_1 with their rate; the error in units of the tolerance."""
         stages = max(2, 1 + int(sqrt(1.0 + 1.54 * dt * self.radius)))
         before, last = self.work
@@ -195,22 +194,18 @@ class Chebyshev:
             if j == 1:
                 vectors.advance(last, self.old, c[4], self.rate_0)
                 continue
-            scheme.rates(last, rate)
+            system.rates(last, rate)
             vectors.chebyshev_stage(new, self.old, before, last, rate, self.rate_0, c)
             before, last, new = last, new, before
         self.y, self.work = last, [before, new]
         self.tau = max(self.least_tau, THETA * dt)
-        scheme.rates(self.y, self.rate_1, self.tau)
+        system.rates(self.y, self.rate_1, self.tau)
         state.evaluations += stages
-        sums = np.empty(2)
-        unknowns.step_error(
-            sums, self.y, self.old, self.rate_1, self.rate_0, dt, self.tolerance, scheme.d.mass,
-            scheme.active.unknowns.strips,
-        )
-        scheme.d.share.ranks.sum(sums)
+        sums = system.step_error(self.y, self.old, self.rate_1, self.rate_0, dt, self.tolerance)
+        system.ranks.sum(sums)
         return float(np.sqrt(sums[0] / sums[1])) if sums[1] > 0.0 else 0.0
 
-    def _accept(self, state: State, dt: float, error: float, limit: float) -> None:
+    def _accept(self, state: Progress, dt: float, error: float, limit: float) -> None:
         error = max(error, 1e-10)
         factor = SAFETY * error ** (-1.0 / 3.0)
         if self.error_before > 0.0:
@@ -223,28 +218,27 @@ class Chebyshev:
         self.age += 1
         self.fresh = True
 
-    def _estimate(self, scheme: Scheme, state: State) -> None:
+    def _estimate(self, system: System, state: Progress) -> None:
         """Spectral radius of the Jacobian by the nonlinear power method.
 
         It starts from the rate with signs that change from node to node: the stiffest modes are among the shortest.
         """
-        places, ranks = scheme.active.unknowns, scheme.d.share.ranks
+        ranks = system.ranks
         (moved, direction), rate = self.work, self.rate_1
-        size = sqrt(_total(ranks, unknowns.squares(self.old, places.strips)))
-        length = sqrt(_total(ranks, unknowns.squares(self.rate_0, places.strips)))
+        size = sqrt(_total(ranks, system.squares(self.old)))
+        length = sqrt(_total(ranks, system.squares(self.rate_0)))
         if length == 0.0:
             self.radius, self.age = 1.0, 0
             return
         delta = 1e-7 * max(size, 1.0)
-        flipped = scheme.d.share.nodes[places.nodes] * 2654435761 % 2**32 >= 2**31
-        np.copyto(direction, np.where(flipped, -self.rate_0, self.rate_0))
+        system.scramble(direction, self.rate_0)
         radius = 0.0
         for _ in range(50):
             vectors.advance(moved, self.old, delta / length, direction)
-            scheme.rates(moved, rate)
+            system.rates(moved, rate)
             state.evaluations += 1
             np.subtract(rate, self.rate_0, out=direction)
-            length = sqrt(_total(ranks, unknowns.squares(direction, places.strips)))
+            length = sqrt(_total(ranks, system.squares(direction)))
             previous, radius = radius, length / delta
             if abs(radius - previous) <= 0.01 * radius or length == 0.0:
                 break

@@ -90,5 +90,5 @@ def distance(moments: Floats) -> float | None:
 
 def box_weights(case: Case, mesh: Mesh, d: Discretisation, low: Floats, high: Floats) -> Floats:
     """omega (n,) on this rank's nodes, zero where another rank owns the node: int_box rho dV = sum omega_a rho_a."""
-    weights = box.box_weights(mesh, low, high, case.nodes.source == "lattice", d.share.ranks)
+    weights = box.box_weights(mesh, low, high, case.nodes.source == "triangular", d.share.ranks)
     return np.where(d.share.halo.owned, weights[d.share.nodes], 0.0)

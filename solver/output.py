@@ -4,6 +4,7 @@ import fcntl
 import json
 import os
 import warnings
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ import numpy as np
 from .arrays import Floats, Numbers
 from .case import Case
 from .checkpoint import replace_durably
-from .geometry import Mesh
 from .partition import Collector, Ranks
 from .state import State
 
@@ -101,20 +101,19 @@ class Snapshots:
     arrays before or after, never between; `time` grows last for all others.
     """
 
-    def __init__(self, directory: Path, case: Case, mesh: Mesh, collector: Collector, fresh: bool) -> None:
-        """Collective. fresh: make the group anew; else go on with the one that is there."""
+    def __init__(self, directory: Path, case: Case, positions: Callable[[], Floats], collector: Collector, fresh: bool) -> None:
+        """Collective. positions: of all nodes (n, dim); fresh: make the group anew, else go on with the one there."""
         self.path, self.collector, self.ranks = directory / "snapshots.zarr", collector, collector.share.ranks
         if self.ranks.root and fresh:
-            create_group(self.path, case, mesh, collector.block)
+            create_group(self.path, case, positions(), collector.block)
         elif self.ranks.root:
             for torn in self.path.rglob("*.partial"):  # files that zarr was writing when the run was killed
                 torn.unlink()
         self.ranks.barrier()
 
-    def write(self, number: int, time: float, state: State, u: Floats) -> None:
-        """Write snapshot `number` (again, where a resumed run passes it again). Collective."""
-        particle, eta_squared = owners(u, state)
-        values = {"rho": u[:, 0], "eta_squared": eta_squared, "particle": particle}
+    def write(self, number: int, time: float, rho: Floats, particle: Numbers, eta_squared: Floats) -> None:
+        """Write snapshot `number` (again, where a resumed run passes it again) of this rank's nodes. Collective."""
+        values = {"rho": rho, "eta_squared": eta_squared, "particle": particle}
         first, last = self.collector.first, self.collector.last
         for name, local in values.items():
             block = self.collector.blocks(np.ascontiguousarray(local))
@@ -145,17 +144,17 @@ def owners(u: Floats, state: State) -> tuple[Numbers, Floats]:
     return np.where(u[:, 0] >= 0.5, particle, -1).astype(np.int32), (eta**2).sum(axis=1)
 
 
-def create_group(path: Path, case: Case, mesh: Mesh, block: int) -> None:
+def create_group(path: Path, case: Case, positions: Floats, block: int) -> None:
     """An empty group with the positions of the nodes."""
     import zarr
 
     group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"name": case.name, "length_unit": "nm"})
-    count, dim = mesh.nodes.shape
+    count, dim = positions.shape
     nodes = group.create_array(
         "nodes", shape=(count, dim), chunks=(block, dim), dtype="float64", dimension_names=("node", "axis"),
         attributes={"units": "nm", "long_name": "position of the node"},
     )  # fmt: skip
-    nodes[:] = mesh.nodes
+    nodes[:] = positions
     group.create_array(
         "time", shape=(0,), chunks=(1,), dtype="float64", dimension_names=("time",),
         attributes={"units": "1", "long_name": "model time"}, fill_value=np.nan,

@@ -59,6 +59,13 @@ class Ranks:
         """Rank 0's object on every rank. For set-up and rare events."""
         return self.comm.bcast(thing) if self.size > 1 else thing
 
+    def to_root(self, thing: Any) -> list[Any] | None:
+        """Every rank's object on rank 0, None elsewhere. For rare events."""
+        if self.size == 1:
+            return [thing]
+        found: list[Any] | None = self.comm.gather(thing)
+        return found
+
     def barrier(self) -> None:
         """Wait for everyone."""
         if self.size > 1:

@@ -19,7 +19,7 @@ def build_mesh(case: Case, ranks: Ranks, rows: bool = True) -> Mesh:
 
     rows: see `geometry.lattice`.
     """
-    if case.nodes.source == "lattice":
+    if case.nodes.source in ("lattice", "triangular"):
         return make_mesh(case.nodes, case.domain.size, rows)
     mesh: Mesh = ranks.from_root(make_mesh(case.nodes, case.domain.size) if ranks.root else None)
     return mesh
@@ -52,7 +52,7 @@ def shortest_distance(case: Case, mesh: Mesh) -> float:
     A lattice has nodes at half the spacing along two walls; they do not limit the step, whose rule is five times
     below the stability limit of a lattice without them.
     """
-    if case.nodes.source == "lattice":
+    if case.nodes.source in ("lattice", "triangular"):
         return float(mesh.spacing.min())
     distance, _ = cKDTree(mesh.nodes).query(mesh.nodes, k=2)
     return float(np.min(np.asarray(distance)[:, 1]))

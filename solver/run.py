@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import singledispatch
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ from .integrators import Integrator
 from .partition import Ranks
 from .scheme import Scheme
 from .state import State
+from .system import Progress, System
 
 LOWEST, HIGHEST = -0.5, 1.5  # fields outside these are not physics any more
 HIGHEST_AT_WALL = 3.0  # but for rho at a wall: nothing there holds a particle that is pressed on; see `piled_up`
@@ -48,13 +50,13 @@ class Event:
 class Observer(Protocol):
     """What listens to a run. All ranks call every method at the same moment."""
 
-    def history(self, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+    def history(self, system: System, state: Progress, u: Floats, time: float) -> None:
         """A history time has been reached; u are the fields there."""
 
-    def snapshot(self, number: int, scheme: Scheme, state: State, u: Floats, time: float) -> None:
+    def snapshot(self, number: int, system: System, state: Progress, u: Floats, time: float) -> None:
         """A snapshot time has been reached."""
 
-    def after_step(self, scheme: Scheme, state: State, integrator: Integrator) -> bool:
+    def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
         """A step has ended well: time for checkpoints and progress. True ends the run here."""
 
 
@@ -76,37 +78,37 @@ def events(case: Case) -> list[Event]:
     return merged
 
 
-def run(scheme: Scheme, state: State, integrator: Integrator, observer: Observer) -> Ending:
+def run(system: System, state: Progress, integrator: Integrator, observer: Observer) -> Ending:
     """March from the state's time to the end of the case, or until the observer ends it.
 
     A fresh state first gives the events of time 0; a resumed one goes on behind its time. Where the work has moved
     from rank to rank (`UNEVEN`), the run ends as well, to be divided anew and resumed.
     """
-    case = scheme.d.case
+    case = system.case
     waiting = [event for event in events(case) if event.time > state.time or state.step == 0]
-    integrator.restart(scheme, state)
-    watch = scheme.d.share.ranks.watch
+    integrator.restart(system, state)
+    watch = system.ranks.watch
     watch.enter("steps")
-    even = scheme.imbalance()
+    even = system.imbalance()
     while waiting:
         limit = waiting[0].time if integrator.stops_at_events else waiting[-1].time
         if state.time < waiting[0].time:
-            integrator.step(scheme, state, limit)
-            check(scheme, state, integrator.y)
+            integrator.step(system, state, limit)
+            check(system, state, integrator.y)
         for event in reached(waiting, state.time):
             with watch("output"):
-                u = integrator.at(scheme, state, event.time) if state.step else state.u
+                u = integrator.at(system, state, event.time) if state.step else system.at(state, integrator.y)
                 if event.history:
-                    observer.history(scheme, state, u, event.time)
+                    observer.history(system, state, u, event.time)
                 if event.snapshot is not None:
-                    observer.snapshot(event.snapshot, scheme, state, u, event.time)
-        if renewed := renew(scheme, state, integrator.y):
-            integrator.restart(scheme, state)
+                    observer.snapshot(event.snapshot, system, state, u, event.time)
+        if renewed := renew(system, state, integrator.y):
+            integrator.restart(system, state)
         with watch("output"):
-            ended = observer.after_step(scheme, state, integrator)
+            ended = observer.after_step(system, state, integrator)
         if ended and waiting:
             return Ending.STOPPED
-        if renewed and waiting and scheme.imbalance() > even + UNEVEN:
+        if renewed and waiting and system.imbalance() > even + UNEVEN:
             return Ending.UNBALANCED
     return Ending.DONE
 
@@ -117,6 +119,7 @@ def reached(waiting: list[Event], time: float) -> Iterator[Event]:
         yield waiting.pop(0)
 
 
+@singledispatch
 def renew(scheme: Scheme, state: State, y: Floats) -> bool:
     """Make the set of live points anew when a value that it rests on has moved, and every `REFRESH` steps.
 
@@ -133,6 +136,7 @@ def renew(scheme: Scheme, state: State, y: Floats) -> bool:
     return True
 
 
+@singledispatch
 def check(scheme: Scheme, state: State, y: Floats) -> None:
     """Raise RunError on every rank where a value of y, the state's unknowns, is none or out of range. Collective."""
     d = scheme.d
@@ -144,6 +148,7 @@ def check(scheme: Scheme, state: State, y: Floats) -> None:
     raise RunError(_said(d.share.ranks, describe(scheme, state, int(here[0])) if here.size else None))
 
 
+@singledispatch
 def piled_up(scheme: Scheme, state: State) -> str | None:
     """Where rho exceeds `HIGHEST` at a wall, or None. Collective.
 

@@ -13,9 +13,10 @@ import numpy as np
 from . import block_kernels, contacts, elimination, kernels, rigid, unknowns
 from .active import Active, activate
 from .arrays import Floats, Integers
+from .case import Case
 from .discretisation import Discretisation
 from .layers import PIECE, Layer
-from .partition import Exchange, pieces
+from .partition import Exchange, Ranks, pieces
 from .simd import LANES
 from .state import State
 
@@ -32,6 +33,16 @@ class Scheme:
         self.contacts = contacts.room(64, d.dim)
         self.rooms: dict[str, Floats] = {}
         self.activate(state)
+
+    @property
+    def case(self) -> Case:
+        """What is computed."""
+        return self.d.case
+
+    @property
+    def ranks(self) -> Ranks:
+        """All ranks."""
+        return self.d.share.ranks
 
     def activate(self, state: State) -> None:
         """Choose the live points and slots for this state (it may move slots), and fit the work arrays. Collective."""
@@ -107,6 +118,35 @@ class Scheme:
         watch.enter("scatter")
         self._scatter(rate)
         watch.enter(before)
+
+    def vector(self, state: State) -> Floats:
+        """y of the state's fields."""
+        return self.active.unknowns.take(state.u)
+
+    def keep(self, state: State, y: Floats) -> None:
+        """Make y the state's fields."""
+        self.active.unknowns.put(state.u, y)
+
+    def at(self, state: State, y: Floats) -> Floats:
+        """The fields (n, F) with y in them."""
+        return self.active.unknowns.put(state.u.copy(), y)
+
+    def squares(self, y: Floats) -> float:
+        """sum y^2 over the nodes that this rank owns."""
+        return float(unknowns.squares(y, self.active.unknowns.strips))
+
+    def step_error(
+        self, new: Floats, old: Floats, rate_1: Floats, rate_0: Floats, dt: float, tolerance: float
+    ) -> Floats:
+        """See `system.System`."""
+        sums, strips = np.empty(2), self.active.unknowns.strips
+        unknowns.step_error(sums, new, old, rate_1, rate_0, dt, tolerance, self.d.mass, strips)
+        return sums
+
+    def scramble(self, direction: Floats, rate: Floats) -> None:
+        """Make direction the rate with signs that change from node to node."""
+        flipped = self.d.share.nodes[self.active.unknowns.nodes] * 2654435761 % 2**32 >= 2**31
+        np.copyto(direction, np.where(flipped, -rate, rate))
 
     def imbalance(self) -> float:
         """By how much the busiest rank's work exceeds the mean, as a part of it; 0 on one rank. Collective."""

@@ -1,0 +1,82 @@
+"""What a run on a lattice asks between steps: whether windows still fit, and whether the fields still mean anything."""
+
+import numpy as np
+
+from ..arrays import Floats
+from ..run import HIGHEST, HIGHEST_AT_WALL, LOWEST, PRESSED, REFRESH, RunError, check, piled_up, renew
+from . import loops, windows
+from .scheme import LatticeScheme, LatticeState
+from .start import fitting_boxes, move
+
+RIM = 1.0  # eps_eta: windows are fitted anew when an order parameter has come to that at the rim of its own
+
+
+@renew.register
+def _(scheme: LatticeScheme, state: LatticeState, y: Floats) -> bool:
+    """Fit the windows to the order parameters when one has reached its rim, and every `REFRESH` steps."""
+    switch, g = scheme.case.activation, scheme.lattice
+    if state.step == 0 or not switch.few_order_parameters:
+        return False
+    most = np.array([windows.rim(y, scheme.layout, np.array(g.nodes), 1)])
+    g.ranks.max(most)
+    if most[0] < RIM * switch.eps_eta and state.step % REFRESH:
+        return False
+    with g.ranks.watch("live points"):
+        (state.y,) = move(scheme, fitting_boxes(scheme, y, switch.eps_eta), y)
+    return True
+
+
+@check.register
+def _(scheme: LatticeScheme, state: LatticeState, y: Floats) -> None:
+    """Raise RunError where rho at a point, or an eta, is none or out of range. Collective."""
+    g, found = scheme.lattice, extremes(scheme)
+    etas = y[scheme.rho :]
+    bad = np.array([max(-found[0], -etas.min(initial=0.0)), found[1], max(found[2], 0.0), etas.max(initial=0.0), found[3]])
+    bad = np.where(np.isnan(bad), np.inf, bad)
+    g.ranks.max(bad)
+    if bad[0] <= -LOWEST and bad[1] <= HIGHEST and bad[2] <= HIGHEST_AT_WALL and bad[3] <= HIGHEST and bad[4] == 0.0:
+        return
+    cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
+    if scheme.case.model.rigid_motion:
+        cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
+        if bad[1] <= HIGHEST and bad[2] > HIGHEST_AT_WALL:
+            cause = f"{PRESSED}, or {cause}"
+    place = place_of(scheme, float(max(bad[1], bad[2])), found)
+    raise RunError(
+        f"at t = {state.time:.6g}, step {state.step}{place}: fields left [{LOWEST:g}, {HIGHEST:g}]: rho up to "
+        f"{max(bad[1], bad[2]):.4g}, eta up to {bad[3]:.4g}, the least {-bad[0]:.4g}; likely cause: {cause}"
+    )
+
+
+@piled_up.register
+def _(scheme: LatticeScheme, state: LatticeState) -> str | None:
+    """Where rho exceeds `HIGHEST` at a wall, or None. Collective."""
+    found = extremes(scheme)
+    most = scheme.ranks.max(np.array([found[2]]))
+    if not most[0] > HIGHEST:
+        return None
+    return f"at t = {state.time:.6g}, step {state.step}{place_of(scheme, float(most[0]), found)}: rho = {most[0]:.4g} at a wall: {PRESSED}"
+
+
+def extremes(scheme: LatticeScheme) -> Floats:
+    """(4,) of rho at this rank's points when the rates were last asked for; see `loops.extremes`."""
+    g, found = scheme.lattice, np.array([np.inf, -np.inf, -np.inf, 0.0])
+    edges = np.array([g.layers.start == 0, g.layers.stop == g.axes[0].cells], dtype=float)
+    cells = 1 if g.axes[1] is None else g.axes[1].cells
+    loops.extremes(found, scheme.points.rho, len(g.layers), cells, g.axes[2].cells, edges)
+    return found
+
+
+def place_of(scheme: LatticeScheme, value: float, found: Floats) -> str:
+    """Where rho has that value at a point, the same text on all ranks; nothing where it is at none. Collective."""
+    g = scheme.lattice
+    said = None
+    if value in (found[1], found[2]):
+        rows, cells = scheme.points.rho[:, loops.GHOSTS : loops.GHOSTS + g.axes[2].cells], g.axes[1]
+        row, c = np.unravel_index(int((rows == value).argmax()), rows.shape)
+        middle = 1 if cells is None else cells.cells
+        p, k, j = np.unravel_index(int(row), (2, len(g.layers), middle))
+        at = [g.axes[2].points[p, c], *([] if cells is None else [cells.points[p, j]]), g.axes[0].points[p, g.layers[k]]]
+        said = f", ({', '.join(f'{x:.3f}' for x in at)}) nm"
+    texts: list[str] = [text[0] for text in g.ranks.everyones(np.array([said], dtype=object)) if text[0] is not None]
+    return texts[0] if texts else ""

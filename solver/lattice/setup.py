@@ -1,0 +1,135 @@
+"""From a case to a run on a lattice, and its checkpoints."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import checkpoint
+from ..arrays import Floats, Numbers
+from ..case import Case
+from ..integrators import RK2, Chebyshev, Integrator, contact_time, paper_step
+from ..partition import Collector, Ranks, Share
+from . import guard, windows
+from .observe import LatticeObservables, nodal
+from .scheme import Lattice, LatticeScheme, LatticeState, axes_of, make_lattice
+from .start import first_boxes, fitting_boxes, initial_fields, move
+from .windows import Boxes, Layout
+
+__all__ = ["LatticeSetup", "guard"]
+
+FIELD_WORK = 1.0  # of one cell for one field, in an evaluation
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a checkpoint holds: the fields on the whole lattice, and their windows."""
+
+    y: Floats
+    boxes: Boxes
+    counts: tuple[float, int, int]
+    memory: dict[str, float]
+    motion: Floats
+    wall_time: float
+
+
+class LatticeSetup:
+    """Nodes on a square or cubic lattice, two material points in each cell. See `setup.Setup`."""
+
+    def __init__(self, case: Case, ranks: Ranks) -> None:
+        self.case, self.ranks = case, ranks
+        self.axes = axes_of(case)
+
+    @property
+    def nodes(self) -> int:
+        """How many there are."""
+        return int(np.prod([axis.cells + 1 for axis in self.axes if axis is not None]))
+
+    def positions(self) -> Floats:
+        """(n, dim) of all of them, nm: along x, then y, then z."""
+        axes = [axis.nodes for axis in self.axes if axis is not None]
+        return np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1).reshape(-1, len(axes))
+
+    def start(self, kept: Kept | None = None) -> tuple[LatticeScheme, LatticeState, Integrator]:
+        """See `setup.Setup`."""
+        boxes = kept.boxes if kept else first_boxes(self.case, make_lattice(self.case, self.ranks))
+        lattice = make_lattice(self.case, self.ranks, self._work(boxes))
+        scheme = LatticeScheme(lattice, boxes)
+        if kept:
+            y = np.zeros(int(scheme.layout.offset[-1]))
+            windows.carry(y, scheme.layout, kept.y, whole(lattice, boxes))
+            state = LatticeState(*kept.counts, y)
+            scheme.motion = kept.motion
+        else:
+            y = initial_fields(self.case, lattice, scheme.layout)
+            if self.case.activation.few_order_parameters:
+                (y,) = move(scheme, fitting_boxes(scheme, y, self.case.activation.eps_eta), y)
+            state = LatticeState(0.0, 0, 0, y)
+        return scheme, state, self._integrator(kept.memory if kept else None)
+
+    def _work(self, boxes: Boxes) -> Floats:
+        """Of each layer of cells."""
+        slow, middle, fast = self.axes
+        work = np.full(slow.cells, 2.0 * (1 if middle is None else middle.cells) * fast.cells)
+        for low, size in zip(boxes.low, boxes.size, strict=True):
+            work[max(0, low[0] - 1) : low[0] + size[0]] += FIELD_WORK * size[1] * size[2]
+        return work
+
+    def _integrator(self, memory: dict[str, float] | None) -> Integrator:
+        shortest = min(axis.step for axis in self.axes if axis is not None)
+        if (tolerance := self.case.time.tolerance) is not None:
+            return Chebyshev(tolerance, contact_time(shortest, self.case), memory)
+        return RK2(self.case.time.step or paper_step(shortest, self.case))
+
+    def share(self, system: LatticeScheme) -> Share:
+        """This rank's nodes."""
+        return system.lattice.share()
+
+    def rows(self, system: LatticeScheme, state: LatticeState) -> LatticeObservables:
+        """What computes the history."""
+        return LatticeObservables(system)
+
+    def nodal(self, system: LatticeScheme, state: LatticeState, u: Floats) -> tuple[Floats, Numbers, Floats]:
+        """See `setup.Setup`."""
+        return nodal(system, u)
+
+    def keep(
+        self, directory: Path, system: LatticeScheme, state: LatticeState, collector: Collector, notes: dict[str, Any]
+    ) -> None:
+        """Write the checkpoint."""
+        g, boxes = system.lattice, system.boxes
+        mine = windows.lay_out(boxes, g.nodes, g.reach, (g.owned.start, g.owned.stop), g.layers)
+        part = np.zeros(int(mine.offset[-1]))
+        windows.carry(part, mine, state.y, system.layout)
+        parts = self.ranks.to_root((part, mine))
+        if parts is None:
+            return
+        layout = whole(g, boxes)
+        y = np.zeros(int(layout.offset[-1]))
+        for theirs, of in parts:
+            windows.carry(y, layout, theirs, of)
+        fields = {"y": y, "motion": system.carried, **{f"window_{name}": getattr(boxes, name) for name in BOXES}}
+        checkpoint.store(directory, fields, state, self.nodes, self.fingerprint(), notes)
+
+    def read(self, directory: Path, identity: str) -> Kept:
+        """See `setup.Setup`."""
+        found: Kept = self.ranks.from_root(self._read(directory, identity) if self.ranks.root else None)
+        return found
+
+    def _read(self, directory: Path, identity: str) -> Kept:
+        values, counts, notes = checkpoint.load(directory, identity, self.nodes, self.fingerprint())
+        boxes = Boxes(**{name: values[f"window_{name}"] for name in BOXES})
+        return Kept(values["y"], boxes, counts, notes["memory"], values["motion"], notes["wall_time"])
+
+    def fingerprint(self) -> str:
+        """Of what the fields stand on."""
+        return "lattice " + " x ".join(f"{axis.cells} of {axis.length!r} reach {axis.reach}" for axis in self.axes if axis)
+
+
+BOXES = ("low", "size", "row", "begin", "end")
+
+
+def whole(lattice: Lattice, boxes: Boxes) -> Layout:
+    """The layout of the windows as if one rank had all of them."""
+    return windows.lay_out(boxes, lattice.nodes, lattice.reach, (0, lattice.nodes[0]), range(0))

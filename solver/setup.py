@@ -1,0 +1,111 @@
+"""From a case to what a run needs: nodes anywhere with a mesh between them, or a lattice whose sums go axis by axis."""
+
+from pathlib import Path
+from typing import Any, Protocol
+
+from . import checkpoint
+from .arrays import Floats, Numbers
+from .case import Case
+from .geometry import Mesh
+from .integrators import Integrator
+from .lattice.setup import LatticeSetup
+from .observe import Observables
+from .output import owners
+from .partition import Collector, Ranks, Share
+from .prepare import build_mesh, make_integrator, prepare
+from .scheme import Scheme
+from .slots import repack
+from .state import State
+
+
+class Rows(Protocol):
+    """Computes history rows."""
+
+    def row(self, system: Any, state: Any, u: Floats, time: float, wall_time: float) -> dict[str, Any]:
+        """One row; collective, and of use on rank 0 alone."""
+
+
+class Setup(Protocol):
+    """All that depends on where the nodes are. Every method but `positions` is collective."""
+
+    @property
+    def nodes(self) -> int:
+        """How many there are."""
+
+    def positions(self) -> Floats:
+        """(n, dim) of all of them, nm."""
+
+    def start(self, kept: Any = None) -> tuple[Any, Any, Integrator]:
+        """System, state and integrator of a fresh run, or of one that goes on from what `read` has given."""
+
+    def share(self, system: Any) -> Share:
+        """This rank's nodes."""
+
+    def rows(self, system: Any, state: Any) -> Rows:
+        """What computes the history."""
+
+    def nodal(self, system: Any, state: Any, u: Floats) -> tuple[Floats, Numbers, Floats]:
+        """rho, owner and sum eta^2 at this rank's nodes."""
+
+    def keep(self, directory: Path, system: Any, state: Any, collector: Collector, notes: dict[str, Any]) -> None:
+        """Write the checkpoint."""
+
+    def read(self, directory: Path, identity: str) -> Any:
+        """The checkpoint, with its `wall_time`, on all ranks. Raises `CheckpointError`."""
+
+
+def make_setup(case: Case, ranks: Ranks, rows: bool = True) -> Setup:
+    """The setup that the case asks for. rows: see `geometry.lattice`."""
+    if case.nodes.source == "lattice" and case.shape_functions.kind == "lme":
+        return LatticeSetup(case, ranks)
+    return MeshSetup(case, ranks, rows)
+
+
+class MeshSetup:
+    """Nodes anywhere; material points in the cells between them."""
+
+    def __init__(self, case: Case, ranks: Ranks, rows: bool = True) -> None:
+        self.case, self.ranks = case, ranks
+        self.mesh: Mesh = build_mesh(case, ranks, rows)
+
+    @property
+    def nodes(self) -> int:
+        """How many there are."""
+        return len(self.mesh.nodes)
+
+    def positions(self) -> Floats:
+        """(n, dim) of all of them, nm."""
+        return self.mesh.nodes
+
+    def start(self, kept: checkpoint.Checkpoint | None = None) -> tuple[Scheme, State, Integrator]:
+        """See `Setup`."""
+        scheme, state = prepare(self.case, self.mesh, self.ranks, kept.reference if kept else None)
+        if kept:
+            nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
+            state.u[:], _ = repack(kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1])
+            if kept.motion is not None:
+                scheme.motion = kept.motion
+        return scheme, state, make_integrator(self.case, self.mesh, kept.memory if kept else None)
+
+    def share(self, system: Scheme) -> Share:
+        """This rank's nodes."""
+        return system.d.share
+
+    def rows(self, system: Scheme, state: State) -> Observables:
+        """What computes the history."""
+        return Observables(self.case, self.mesh, system.d, len(state.slot_of))
+
+    def nodal(self, system: Scheme, state: State, u: Floats) -> tuple[Floats, Numbers, Floats]:
+        """See `Setup`."""
+        return u[:, 0], *owners(u, state)
+
+    def keep(self, directory: Path, system: Scheme, state: State, collector: Collector, notes: dict[str, Any]) -> None:
+        """Write the checkpoint."""
+        checkpoint.write(directory, system, state, collector, self.mesh, notes)
+
+    def read(self, directory: Path, identity: str) -> checkpoint.Checkpoint:
+        """See `Setup`."""
+        found: checkpoint.Checkpoint = self.ranks.from_root(
+            checkpoint.read(directory, identity, self.mesh) if self.ranks.root else None
+        )
+        return found

@@ -32,6 +32,7 @@ from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
 from .prepare import build_mesh, make_integrator, prepare
+from .revision import recorded, revision_of
 from .run import Ending, RunError, piled_up, run
 from .scheme import Scheme
 from .shape import ShapeError
@@ -41,6 +42,7 @@ REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
 SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
 ANEW = "it was stopped before its first checkpoint: begun anew from case.json"
+MIXED = "begun by revision {before} of the solver, gone on with by revision {now}: it counts as of the older one"
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
@@ -274,14 +276,18 @@ class Recorder:
 def record_start(
     directory: Path, case: Case, ranks: int, fresh: bool, packing: dict[str, Any] | None = None
 ) -> None:
-    """run.json: what runs here, with which versions and packing, since when. A resumed run keeps the first start."""
+    """run.json: what runs here, with which versions and packing, since when. A resumed run keeps the first start, and
+    the oldest revision of the results that had a part in it.
+    """
     path = directory / "run.json"
     before = json.loads(path.read_text()) if path.exists() and not fresh else {}
+    now, begun = revision_of(case.tree()), recorded(before)
     record = {
         "state": "running",
         "message": None,
         "retry": False,
         "case": case.identity(),
+        "revision": now if begun is None else min(begun, now),
         "name": case.name,
         "ranks": ranks,
         "host": socket.gethostname(),
@@ -294,6 +300,8 @@ def record_start(
         "end": None,
     }
     output.write_json(path, record)
+    if begun is not None and begun != now:
+        record_note(directory, MIXED.format(before=begun, now=now))
 
 
 def record_end(

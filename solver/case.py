@@ -168,13 +168,16 @@ class Table(BaseModel):
 
     `owned` has the fields that go with each setting of the `switches`: `...` for one that must be given, else
     its default. Those that go with another setting only are refused. `alone` names fields of which the table checks
-    whether they are given, but never their value against another field's.
+    whether they are given, but never their value against another field's. `added` has the defaults of fields that came
+    after the first release of identities: at its default such a field is no part of the identity, which old cases so
+    keep. A field is not in both.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
     switches: ClassVar[tuple[str, ...]] = ()
     owned: ClassVar[Mapping[tuple[str, ...], Mapping[str, Any]]] = {(): {}}
     alone: ClassVar[tuple[str, ...]] = ()
+    added: ClassVar[Mapping[str, Any]] = {}
 
     @model_validator(mode="wrap")
     @classmethod
@@ -214,8 +217,9 @@ class Table(BaseModel):
         return self.model_dump(mode="json", exclude_none=True)
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """What of the table's tree changes the result."""
-        return tree
+        """What of the table's tree changes the result; the tree itself where all of it does."""
+        old = {key for key, default in self.added.items() if key in tree and tree[key] == default}
+        return {key: value for key, value in tree.items() if key not in old} if old else tree
 
 
 @cache
@@ -266,6 +270,7 @@ class Nodes(Table):
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
         """A mesh file counts by its content, wherever it is."""
+        tree = super().essence(tree)
         if self.path is None:
             return tree
         return tree | {"path": hashlib.sha256(Path(self.path).read_bytes()).hexdigest()}
@@ -496,7 +501,7 @@ class Output(Table):
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
         """How often a checkpoint is written changes nothing."""
-        return {key: value for key, value in tree.items() if key != "checkpoint_every"}
+        return {key: value for key, value in super().essence(tree).items() if key != "checkpoint_every"}
 
     def snapshot_count(self, end: float) -> float:
         """How many snapshots a run to `end` writes, reckoned without making them."""
@@ -646,8 +651,8 @@ def canonical(tree: Mapping[str, Any]) -> str:
 
 
 def fingerprint(tables: Mapping[str, str]) -> str:
-    """SHA-256 of a case, from the canonical text of each table."""
-    body = ", ".join([f'"{name}": {tables[name]}' for name in sorted(tables)])
+    """SHA-256 of a case, from the canonical text of each table; a table that says nothing is left out."""
+    body = ", ".join([f'"{name}": {tables[name]}' for name in sorted(tables) if tables[name] != "{}"])
     return hashlib.sha256(f"{{{body}}}".encode()).hexdigest()
 
 

@@ -9,6 +9,7 @@ particles nothing was measured. Compiling and packing are left out.
 """
 
 import json
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import ceil, exp, log, pi, prod, sqrt
@@ -238,6 +239,8 @@ class Plan:
     """points left out as an earlier one is the same case"""
     done: int
     """cases that have been computed before"""
+    older: dict[str, int]
+    """by revision of the solver: how many cases an older one has computed, and are not to be computed anew"""
     to_run: int
     """cases that are missing"""
     core_hours: float
@@ -250,10 +253,12 @@ class Plan:
     def rows(self) -> list[tuple[str, str]]:
         """The plan as a table of words and figures."""
         hours = f"{self.core_hours:.2g} ({self.source})" if self.to_run else "0"
+        older = ", ".join(f"{n} by revision {revision}" for revision, n in self.older.items())
         return [
             ("points", f"{self.points + self.duplicates}"),
             ("duplicates", f"{self.duplicates}"),
             ("already done", f"{self.done}"),
+            *([("by an older solver", f"{older}; --recompute computes them anew")] if older else []),
             ("to run", f"{self.to_run}"),
             ("core-hours", hours),
             ("ranks kept busy", ", ".join(f"{ranks}: {part:.0%}" for ranks, part in self.busy.items()) or "-"),
@@ -273,9 +278,19 @@ def busy(case: Case) -> dict[str, float]:
     return {str(ranks): part for ranks, part in found.items()}
 
 
-def plan(expansion: Expansion, past: Sequence[Measured] = (), done: Collection[str] = ()) -> Plan:
-    """The plan of an expanded sweep; `done` are the identities of cases that need not be computed."""
-    missing = [point for point in expansion.points if point.identity not in done]
+def plan(
+    expansion: Expansion,
+    past: Sequence[Measured] = (),
+    done: Collection[str] = (),
+    older: Mapping[str, int] | None = None,
+) -> Plan:
+    """The plan of an expanded sweep; `done` are the identities of cases that need not be computed, `older` those of
+    cases that another revision of the solver has computed, which one, and that are not to be computed anew.
+    """
+    by = dict(older or {})
+    stale = Counter(str(by[point.identity]) for point in expansion.points if point.identity in by)
+    kept = {*done, *by}
+    missing = [point for point in expansion.points if point.identity not in kept]
     experience = Experience(past)
     cases = [json.loads(point.case) for point in missing]
     guesses = [experience.estimate(case) for case in cases]
@@ -287,7 +302,8 @@ def plan(expansion: Expansion, past: Sequence[Measured] = (), done: Collection[s
         busy=busy(costliest[1]) if costliest else {},
         points=len(expansion.points),
         duplicates=expansion.duplicates,
-        done=len(expansion.points) - len(missing),
+        done=len(expansion.points) - len(missing) - stale.total(),
+        older=dict(sorted(stale.items())),
         to_run=len(missing),
         core_hours=sum(guess.core_seconds for guess in guesses) / 3600,
         source=source,

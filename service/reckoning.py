@@ -78,12 +78,24 @@ def mesh_of(case: Tree) -> tuple[float, float]:
     size, given = case["domain"]["size"], case["nodes"]
     if given["source"] != "file":
         nodes = amounts.nodes(size, given["spacing"])
-        return nodes, amounts.points(nodes, len(size))
+        cells = amounts.points(nodes, len(size))
+        return nodes, cells if given["source"] == "lattice" else _points(case, nodes, cells)
     try:
         found = shapes(given["path"])
     except (OSError, MeshFileError):
         return 0.0, 0.0  # the ranks will say so
-    return float(found.nodes), float(found.cells["triangle" if len(size) == 2 else "tetra"])
+    nodes, cells = float(found.nodes), float(found.cells["triangle" if len(size) == 2 else "tetra"])
+    return nodes, _points(case, nodes, cells)
+
+
+def _points(case: Tree, nodes: float, cells: float) -> float:
+    """Material points on nodes that are no lattice: on one of their own, or one in each cell."""
+    size, points = case["domain"]["size"], case["points"]
+    if points["source"] == "cells" or case["shape_functions"]["kind"] == "linear":
+        return cells
+    if (pitch := points.get("pitch")) is not None:
+        return math.prod(amounts.quotient(length, pitch) for length in size)
+    return nodes * amounts.POINTS ** len(size)
 
 
 def particles_of(given: Tree) -> float:

@@ -21,8 +21,8 @@ from .simd import LANES
 from .state import State, width
 from .unknowns import Unknowns
 
-LEAST = 3.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
-SLOT_EPS = 0.3  # eps_eta: unit in which an order parameter's growth is measured where it does not exist yet
+LEAST = 1.0  # eps_eta: an order parameter exists at a point where it or its gradient (per nm) is at least this
+SLOT_EPS = 0.2  # eps_eta: unit in which an order parameter's growth is measured where it does not exist yet
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from launching import Case
 from reference import mean_in_box
 from scipy.spatial import ConvexHull
 
+from frit.solver import field
 from frit.solver.arrays import Floats
 from frit.solver.case import load_case, parse_case
 from frit.solver.discretisation import Discretisation, discretise
@@ -23,6 +24,7 @@ from frit.solver.prepare import build_mesh, prepare
 PACK = Path(__file__).parent.parent / "sweeps/cases/pack.toml"
 SIZES = {2: (30.0, 26.0), 3: (16.0, 15.0, 14.0)}
 RADIUS = {2: 9.0, 3: 5.0}
+POINTS = {"linear": {2: 160, 3: 72}, "lme": {2: 60, 3: 24}}  # of Gauss along each axis
 FUNCTIONS: list[dict[str, Any]] = [*({"kind": "lme", "gamma": g} for g in (0.8, 1.8, 4.0)), {"kind": "linear"}]
 
 
@@ -83,14 +85,22 @@ def test_linear_fields_are_integrated_exactly(size: tuple[float, ...], kind: str
         assert mean == pytest.approx(0.4 + 0.5 * (low + high) @ slope, abs=1e-12)
 
 
+def started(case: Case, ranks: Ranks) -> tuple[Any, Mesh, Discretisation, Floats]:
+    """The case as parsed, and the coefficients of rho that a run starts from."""
+    parsed = parse_case(case)
+    mesh = build_mesh(parsed, ranks)
+    scheme, state = prepare(parsed, mesh, ranks)
+    return parsed, mesh, scheme.d, state.rho
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_particle_in_the_box_is_measured_whole(dim: int, ranks: Ranks) -> None:
     """1e-4 of V_box is what the model asks for. No face cuts the interface."""
     size, centre = SIZES[dim], 0.5 * np.array(SIZES[dim]) + 0.13
-    case = tree(size)
-    mesh, d = meshed(case, ranks)
+    particle = {"centres": [centre.tolist()], "radii": [0.6 * RADIUS[dim]]}
+    case, mesh, d, rho = started(tree(size, particles=particle), ranks)
     low, high = 0.07 * np.array(size), 0.94 * np.array(size)
-    mean = box_weights(parse_case(case), mesh, d, low, high) @ profile(d.positions, centre, 0.6 * RADIUS[dim])
+    mean = box_weights(case, mesh, d, low, high) @ rho
     exact = subdivided(low, high, lambda x: profile(x, centre, 0.6 * RADIUS[dim]), {2: 800, 3: 120}[dim])
     assert mean / np.prod(high - low) == pytest.approx(exact, abs=1e-4)
 
@@ -98,30 +108,36 @@ def test_a_particle_in_the_box_is_measured_whole(dim: int, ranks: Ranks) -> None
 @pytest.mark.parametrize("kind", ["lme", "linear"])
 def test_a_pack_is_measured_to_a_ten_thousandth(kind: str, ranks: Ranks) -> None:
     """What the model asks for, where it matters: a box whose faces cut many particles, in and out alike."""
-    case = parse_case(load_case(PACK).tree() | {"shape_functions": {"kind": kind}})
-    mesh = build_mesh(case, ranks)
-    d = discretise(case, mesh, ranks, np.ones(len(mesh.points)))
+    case, mesh, d, solid = started(load_case(PACK).tree() | {"shape_functions": {"kind": kind}}, ranks)
     discs = list(zip(case.particles.centres, case.particles.radii, strict=True))
 
     def rho(x: Floats) -> Floats:
         return np.minimum(sum(profile(x, centre, radius) for centre, radius in discs), 1.0)
 
-    solid = rho(d.positions)
     for shift in (0.0, 0.3, 1.7, -2.2):
         low, high = np.add(case.output.vacancy_box, [[shift], [0.7 * shift]])
         mean = box_weights(case, mesh, d, low, high) @ solid / np.prod(high - low)
         assert mean == pytest.approx(subdivided(low, high, rho, 500), abs=1e-4)
 
 
-def cut_error(dim: int, functions: dict[str, Any], spacing: float, ranks: Ranks) -> float:
-    """In units of V_box, for a box that the interface of one particle leaves through every face."""
+def cut_error(dim: int, functions: dict[str, Any], spacing: float, nodes: dict[str, Any], ranks: Ranks) -> float:
+    """Against the field's own integral, in units of V_box, for a box that the interface of one particle leaves through
+    every face."""
     size, centre = SIZES[dim], 0.5 * np.array(SIZES[dim]) + 0.13
-    case = tree(size, spacing, shape_functions=functions)
-    mesh, d = meshed(case, ranks)
+    particle = {"centres": [centre.tolist()], "radii": [RADIUS[dim]]}
+    made = tree(size, spacing, shape_functions=functions, particles=particle)
+    case, mesh, d, rho = started(made | {"nodes": {"spacing": spacing} | nodes}, ranks)
     low, high = 0.21 * np.array(size), 0.77 * np.array(size)
-    mean = box_weights(parse_case(case), mesh, d, low, high) @ profile(d.positions, centre, RADIUS[dim])
-    exact = mean_in_box(lambda x: profile(x, centre, RADIUS[dim]), low, high, {2: 160, 3: 72}[dim])
-    return float(abs(mean / np.prod(high - low) - exact))
+    mean = box_weights(case, mesh, d, low, high) @ rho
+
+    def of_coefficients(x: Floats) -> Floats:
+        return field.at(case, mesh, x.reshape(-1, dim), rho[:, None])[:, 0].reshape(x.shape[:-1])
+
+    def samples(x: Floats) -> Floats:
+        return profile(x, centre, RADIUS[dim])
+
+    wanted, points = (samples if functions["kind"] == "linear" else of_coefficients), POINTS[functions["kind"]][dim]
+    return float(abs(mean / np.prod(high - low) - mean_in_box(wanted, low, high, points)))
 
 
 @pytest.mark.parametrize("functions", FUNCTIONS, ids=["0.8", "1.8", "4", "linear"])
@@ -129,14 +145,19 @@ def cut_error(dim: int, functions: dict[str, Any], spacing: float, ranks: Ranks)
 def test_a_particle_that_the_box_cuts_is_measured_to_a_ten_thousandth(
     dim: int, functions: dict[str, Any], ranks: Ranks
 ) -> None:
-    """Whatever the shape functions smooth: nodal values count as samples."""
-    assert cut_error(dim, functions, 1.0, ranks) < 1e-4
+    """The integral of the field; nodal values of linear functions count as samples."""
+    assert cut_error(dim, functions, 1.0, {}, ranks) < 1e-4
+
+
+def test_any_nodes_measure_the_field(ranks: Ranks, gmsh: Any) -> None:
+    """By a rule of its own points: the field's integral to 1e-5 wherever the nodes are."""
+    assert cut_error(2, {"kind": "lme"}, 1.0, {"source": "gmsh"}, ranks) < 1e-5
 
 
 def test_the_error_of_cut_particles_falls_with_the_fourth_power_of_the_spacing(ranks: Ranks) -> None:
     """The rule is exact for cubics, so that h^4 times fourth derivatives is the first thing left."""
     spacings = np.array([1.0, 0.5, 0.25])
-    errors = [cut_error(2, {"kind": "linear"}, spacing, ranks) for spacing in spacings]
+    errors = [cut_error(2, {"kind": "linear"}, spacing, {}, ranks) for spacing in spacings]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(spacings))
     assert (slopes > 3.5).all(), errors  # 4, but for where the box's faces lie in the lattice
 

@@ -179,3 +179,15 @@ def test_missing_or_empty_snapshots_are_named(tmp_path: Path) -> None:
     zarr.create_group(tmp_path / "snapshots.zarr").create_array("time", data=np.empty(0))
     with pytest.raises(PlotError, match="no snapshots"):
         plots.nearest_time(tmp_path, 0.0)
+
+
+def test_crowded_nodes_are_thinned_and_even_ones_are_not() -> None:
+    """Columns 0.01 nm apart: the nine nearest nodes would all lie on one line."""
+    even = scattered([20.0, 12.0], 1.0)
+    assert plots.thinned(even).sum() > 0.95 * len(even)
+    columns = np.sort(np.concatenate([np.arange(0.0, 20.0, 2.0), np.arange(0.0, 20.0, 2.0) + 0.01]))
+    paired = np.stack(np.meshgrid(columns, np.arange(0.0, 12.0, 1.0)), axis=-1).reshape(-1, 2)
+    kept = paired[plots.thinned(paired)]
+    assert len(kept) == len(paired) / 2
+    _, near = cKDTree(kept).query([[9.0, 6.0]], 9)
+    assert len(np.unique(kept[near[0], 0])) > 1

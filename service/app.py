@@ -1,10 +1,8 @@
 """The HTTP interface: routes only. What they take and give is in views.py, who may use them in security.py."""
 
 import asyncio
-import csv
 import gc
 import hashlib
-import io
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -13,6 +11,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel
+from starlette.responses import StreamingResponse
 
 from . import admission, delivery, filters, metrics, openapi, stream, views
 from .bodies import AT_ONCE, SMALL, LimitedRoute, declared
@@ -193,24 +192,20 @@ async def show_job(request: Request, engine: TheEngine, who: Reader, job: TheJob
 
 @api.get("/jobs/{id}/history", tags=["jobs"], response_class=Response, responses=openapi.history())
 async def show_history(request: Request, engine: TheEngine, who: Reader, job: TheJob) -> Response:
-    """The history rows so far: JSON, or CSV of the scalar columns by Accept."""
-    rows = [line for _, line in await asyncio.to_thread(engine.store.history, job.id)]
-    vary = {"Vary": "Accept"}
-    if delivery.prefers(request.headers.get("accept", "*/*"), "text/csv", "application/json"):
-        table = await asyncio.to_thread(as_csv, rows)
-        return delivery.tagged(request, table.encode(), "text/csv; charset=utf-8", vary)
+    """The history rows so far: JSON, or CSV of the scalar columns by Accept. A long one has no tag."""
+    store, accept = engine.store, request.headers.get("accept", "*/*")
+    first = await asyncio.to_thread(store.history, job.id, 0, delivery.ROWS + 1)
+    rows, vary, table = [line for _, line in first], {"Vary": "Accept"}, "text/csv; charset=utf-8"
+    as_table = delivery.prefers(accept, "text/csv", "application/json")
+    if len(rows) > delivery.ROWS:
+        if as_table:
+            columns = await asyncio.to_thread(store.columns, job.seq)
+            return StreamingResponse(delivery.long_csv(store, job.id, columns), 200, vary, table)
+        return StreamingResponse(delivery.long_json(store, job.id), 200, vary, "application/json")
+    if as_table:
+        text = await asyncio.to_thread(delivery.as_csv, rows)
+        return delivery.tagged(request, text.encode(), table, vary)
     return delivery.tagged(request, f"[{','.join(rows)}]".encode(), "application/json", vary)
-
-
-def as_csv(rows: list[str]) -> str:
-    """The scalar columns of history rows; one that a row does not have is empty there."""
-    trees = [json.loads(row) for row in rows]
-    columns = {key: None for tree in trees for key, value in tree.items() if not isinstance(value, list | dict)}
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(columns), extrasaction="ignore")
-    writer.writeheader()
-    writer.writerows(trees)
-    return text.getvalue()
 
 
 @api.get("/jobs/{id}/log", tags=["jobs"], response_class=Response, responses=openapi.file("text/plain"))

@@ -1,19 +1,25 @@
-"""Bytes over HTTP: files of a run directory by Range, entity tags, and what a client accepts."""
+"""Bytes over HTTP: files of a run directory by Range, histories, entity tags, and what a client accepts."""
 
+import csv
 import hashlib
+import io
+import json
 import os
 import re
 import stat
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import anyio.to_thread
 from fastapi import Request
 from starlette.responses import Response, StreamingResponse
 
 from .problems import HttpError, not_found
+from .store import Store
 
 PIECE = 1 << 18  # bytes read at once
+ROWS = 5000  # of a history that are in memory at once
 RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
@@ -138,3 +144,48 @@ def prefers(accept: str, first: str, second: str) -> bool:
         return best[1]
 
     return weight(first) > weight(second)
+
+
+# --- histories
+
+
+def as_csv(rows: Sequence[str]) -> str:
+    """The scalar columns of history rows; one that a row does not have is empty there."""
+    trees = [json.loads(row) for row in rows]
+    columns = {key: None for tree in trees for key, value in tree.items() if not isinstance(value, list | dict)}
+    return _table(trees, list(columns), heading=True)
+
+
+def _table(trees: Sequence[Mapping[str, Any]], columns: Sequence[str], heading: bool) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, extrasaction="ignore")
+    if heading:
+        writer.writeheader()
+    writer.writerows(trees)
+    return text.getvalue()
+
+
+async def _parts(store: Store, job: str, write: Callable[[list[str], bool], str]) -> AsyncIterator[str]:
+    """A history part by part, as `write` writes its rows; it is told which part is the first."""
+
+    def part(since: int) -> tuple[int, str]:
+        found = store.history(job, since, ROWS)
+        return (found[-1][0] + 1, write([line for _, line in found], since == 0)) if found else (since, "")
+
+    since, text = await anyio.to_thread.run_sync(part, 0)
+    while text:
+        yield text
+        since, text = await anyio.to_thread.run_sync(part, since)
+
+
+async def long_json(store: Store, job: str) -> AsyncIterator[str]:
+    """A history of any length, of which few rows are in memory at a time."""
+    yield "["
+    async for text in _parts(store, job, lambda rows, first: ("" if first else ",") + ",".join(rows)):
+        yield text
+    yield "]"
+
+
+def long_csv(store: Store, job: str, columns: Sequence[str]) -> AsyncIterator[str]:
+    """The same as a table."""
+    return _parts(store, job, lambda rows, first: _table([json.loads(row) for row in rows], columns, heading=first))

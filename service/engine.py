@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from .backends.local import LocalBackend
-from .files import try_lock
+from .files import make_private, try_lock
 from .hub import Hub
 from .jobs import Job, NewJob
 from .migrations import IndexVersionError
@@ -133,7 +133,8 @@ def check(settings: Settings) -> str | None:
 def take(data: Path) -> int:
     """Make the data folder and lock it for this process."""
     try:
-        (data / "runs").mkdir(parents=True, exist_ok=True)
+        make_private(data)
+        (data / "runs").mkdir(exist_ok=True)
         lock = try_lock(data / "lock")
         if lock is not None:
             sign(lock)

@@ -46,6 +46,11 @@ def remove_torn(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def make_private(folder: Path) -> None:
+    """Make a data folder that only its owner may look into; one that is there stays as open as somebody made it."""
+    folder.mkdir(0o700, parents=True, exist_ok=True)
+
+
 def flush_folder(folder: Path) -> None:
     """Make new names in it durable."""
     handle = os.open(folder, os.O_RDONLY)

@@ -1,7 +1,10 @@
 """Wakes whoever waits for something to happen: a commit of the index, a line of progress, the end of a runner."""
 
 import asyncio
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+SHARE = 0.3  # of the loop's time, for looks that followers take, however many there are
 
 
 class Hub:
@@ -11,6 +14,7 @@ class Hub:
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
         self.count = 0  # of notifications
+        self._turn = asyncio.Lock()
 
     def notify(self) -> None:
         """Something has happened."""
@@ -34,3 +38,14 @@ class Hub:
         except TimeoutError:
             return False
         return True
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """One look at a time, and pauses between them: a notification wakes all followers at once.
+
+        What is within may not wait for anything.
+        """
+        async with self._turn:
+            began = self._loop.time()
+            yield
+            await asyncio.sleep((self._loop.time() - began) * (1 / SHARE - 1))

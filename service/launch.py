@@ -21,8 +21,8 @@ from .files import read_json, stamp
 
 ENDS = ("done", "failed", "interrupted", "refused")
 # An outer MPI or Slurm step, which the ranks would join (PMI covers PMIX), and what makes Python write
-# a printed line in two parts, between which another rank's may get.
-SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL", "PYTHONUNBUFFERED")
+# a printed line in two parts, between which another rank's may get. No rank needs a token.
+SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL", "PYTHONUNBUFFERED", "FRIT_TOKEN")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM")
 OPEN_MPI = dict.fromkeys(AS_ROOT, "1") | {"OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self,sm"}

@@ -637,6 +637,14 @@ class Store:
             query = sa.select(history.c.row, history.c.data).where(history.c.job == seq, history.c.row >= since)
             return [(row.row, row.data) for row in connection.execute(query.order_by(history.c.row).limit(limit))]
 
+    def columns(self, seq: int) -> list[str]:
+        """Names of the scalars in the history rows of a job, in the order in which they come."""
+        query = (
+            "SELECT key FROM history, json_each(history.data) WHERE job = ? AND type NOT IN ('array', 'object') "
+            "GROUP BY key ORDER BY min(row), min(json_each.id)"
+        )
+        return [key for (key,) in self._ask(query, (seq,))]
+
     def snapshots(self, identifier: str) -> list[tuple[int, float]]:
         """(number, time) of the complete snapshots."""
         with self.reading() as connection:
@@ -977,10 +985,10 @@ def _set(t: Transaction, job: Job, event: float | None = None, **values: Any) ->
     t.note("set", job=job.seq, event=event, values=values)
 
 
-def _retry(t: Transaction, job: Job) -> Job:
-    """A new life: what broke before does not count."""
+def _retry(t: Transaction, job: Job, **values: Any) -> Job:
+    """A new life: what broke before does not count. `values`: of other columns."""
     t.durable = True
-    return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None)
+    return _move(t, job, Move.RETRY, None, retrying=False, failures=0, ended=None, **values)
 
 
 def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReusedError]:
@@ -1090,20 +1098,45 @@ def _existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
 
 
 def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
-    """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done."""
-    numbers = _existing(t.connection, [point.job.identity for point in points])
-    undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
+    """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done.
+
+    Whoever queued the old one may have wished for less: it gets the priority, the time and the ranks asked for now.
+    """
+    asked = {point.job.identity: point.job for point in points}
+    numbers = _existing(t.connection, list(asked))
     old = list(numbers.values())
+    undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
+    waiting = (jobs.c.state == State.QUEUED) | jobs.c.retrying
+    urgent = max((job.priority for job in asked.values()), default=0)
+    modest = waiting & ((jobs.c.priority < urgent) | jobs.c.time_limit.is_not(None))
+    small = (jobs.c.state == State.FAILED) & (jobs.c.ranks < max((job.ranks for job in asked.values()), default=1))
     for k in range(0, len(old), 500):
-        query = sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]), undone)
+        query = sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]), undone | modest | small)
         for row in t.run(query).all():
-            _retry(t, _record(row))
+            job, more = _record(row), _more(row, asked[row.identity])
+            if job.state is State.QUEUED or job.retrying:
+                if more:
+                    _set(t, job, **more)
+            elif job.state is not State.FAILED:
+                _retry(t, job, **more)
+            elif job.ranks < asked[job.identity].ranks:  # it may have been short of memory, which goes with the ranks
+                _retry(t, job, **more, ranks=asked[job.identity].ranks)
     missing: dict[str, NewJob] = {}
     for point in points:
         if point.job.identity not in numbers:
             missing.setdefault(point.job.identity, point.job)
     new = _insert(t, list(missing.values()))
     return numbers | {job.identity: job.seq for job in new}
+
+
+def _more(job: Any, asked: NewJob) -> dict[str, Any]:
+    """What a job lacks of the priority and the time that are asked for."""
+    more: dict[str, Any] = {}
+    if asked.priority > job.priority:
+        more["priority"] = asked.priority
+    if job.time_limit is not None and (asked.time_limit is None or asked.time_limit > job.time_limit):
+        more["time_limit"] = asked.time_limit
+    return more
 
 
 def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> dict[str, Any]:

@@ -34,14 +34,17 @@ async def events(
     """`state`, `history`, `progress`, and `end` once the job is final; no more once the client is not admitted."""
     store, (event, rows), told = engine.store, place(last_event_id), None
     hidden = str(engine.settings.data.absolute())
-    while admitted():
+    while True:
         looked = time.monotonic()
-        try:
-            job = store.job(identifier)
-            changes = store.events(identifier, event)
-            added = store.history(identifier, rows, ROWS)
-        except (StoreError, NotFoundError):  # the client comes back
-            return
+        async with engine.hub.turn():
+            if not admitted():
+                return
+            try:
+                job = store.job(identifier)
+                changes = store.events(identifier, event)
+                added = store.history(identifier, rows, ROWS)
+            except (StoreError, NotFoundError):  # the client comes back
+                return
         complete = len(added) < ROWS
         # the end of a job is told after its last row, whatever it was; so keep the last change back
         kept = changes[-1:] if job.final or not complete else []

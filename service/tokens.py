@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from . import migrations
-from .files import flush_folder
+from .files import flush_folder, make_private
 from .store import BUSY, NotFoundError, StoreError, Token
 
 SCOPES = ("read", "submit", "admin")  # each allows all that the ones before allow
@@ -42,7 +42,7 @@ def is_marked(folder: Path) -> bool:
 def set_mark(folder: Path) -> None:
     """Make the mark durable, before the first token is."""
     if not is_marked(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private(folder)
         with open(folder / MARK, "w", encoding="utf-8") as file:
             file.write("This folder has or had access tokens: frit serves it only to who brings one.\n")
             file.flush()

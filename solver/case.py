@@ -113,6 +113,7 @@ def _few(value: object) -> object:
 
 
 Text = Annotated[str, Field(strict=True), AfterValidator(showable)]
+Name = Annotated[str, Field(strict=True, max_length=10_000), AfterValidator(showable)]  # of a point: long
 Point = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3), BeforeValidator(_few)]
 Edges = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3), BeforeValidator(_few)]
 Box = tuple[Point, Point]
@@ -538,7 +539,7 @@ class Output(Table):
 class Case(Table):
     """A resolved case: every default filled in, every file found or read, every check passed."""
 
-    name: Text = "untitled"
+    name: Name = "untitled"
     """free text, without effect on the result"""
     domain: Domain
     """the box that is simulated"""

@@ -8,14 +8,17 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
-from frit.solver.case import CaseError, Place, Problem, Text, case_schema, read_tree, refusal, unknown_part
+from frit.solver.case import CaseError, Place, Problem, case_schema, read_tree, refusal, showable, unknown_part
 
 FREE = ("name", "output.checkpoint_every")  # keys that change no result: axes along them would repeat one case
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Whole = Annotated[int, Field(strict=True)]
+# Every point has the words of its sweep: they are short, as those of a job are.
+Name = Annotated[str, Field(strict=True, max_length=500), AfterValidator(showable)]
+Label = Annotated[str, Field(strict=True, max_length=100), AfterValidator(showable)]
 
 
 class Part(BaseModel):
@@ -114,13 +117,13 @@ class Sample(Part):
 class Sweep(Part):
     """A checked definition. Whether its points are possible cases shows when it is expanded."""
 
-    name: Text = "untitled"
+    name: Name = "untitled"
     """free text; names of points start with it"""
     ranks: Annotated[Whole, Field(ge=1)] = 1
     """MPI ranks per job"""
-    priority: Whole = 0
+    priority: Annotated[Whole, Field(ge=-1_000_000, le=1_000_000)] = 0
     """jobs of higher priority start first"""
-    tags: Annotated[tuple[Text, ...], Field(max_length=50, fail_fast=True)] = ()
+    tags: Annotated[tuple[Label, ...], Field(max_length=50, fail_fast=True)] = ()
     """free labels of the jobs"""
     base: dict[str, Any]
     """a case; in a file also the path of one, relative to it. What an axis sets may be left out"""

@@ -669,3 +669,10 @@ def test_only_the_beginning_of_a_refused_value_is_written_out() -> None:
 def test_a_name_has_no_control_characters(text: str) -> None:
     with pytest.raises(CaseError, match=r"name = .*: must have no control characters"):
         parse_case({**minimal(), "name": text})
+
+
+def test_a_name_is_not_a_text_of_any_length() -> None:
+    tree = tomllib.loads(TWO_DISCS)
+    assert parse_case(tree | {"name": "a" * 10_000}).name == "a" * 10_000
+    with pytest.raises(CaseError, match="must have at most 10000 characters"):
+        parse_case(tree | {"name": "a" * 10_001})

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from serving import ended, new_job, settings, submit, until
 
-from frit.service.engine import Engine
+from frit.service import tokens
+from frit.service.engine import Engine, take
 from frit.service.files import is_at, read_json, remove_torn, write_json
 from frit.service.jobs import State
 
@@ -28,6 +29,19 @@ def test_many_threads_write_one_file(tmp_path: Path) -> None:
         list(pool.map(write, range(8)))
     assert read_json(path)["number"] in range(8)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_new_data_folder_is_its_owners_alone(tmp_path: Path) -> None:
+    """Cases, results and locks of members are for who has a token, not for everybody on the machine."""
+    os.close(take(tmp_path / "a" / "served"))
+    tokens.create(tmp_path / "b" / "tokens", "me", "read")
+    for folder in (tmp_path / "a" / "served", tmp_path / "b" / "tokens"):
+        assert folder.stat().st_mode & 0o777 == 0o700
+    opened = tmp_path / "opened"
+    opened.mkdir()
+    opened.chmod(0o750)
+    os.close(take(opened))
+    assert opened.stat().st_mode & 0o777 == 0o750  # whoever made it so has reasons
 
 
 def test_what_a_killed_writer_left_is_removed(tmp_path: Path) -> None:

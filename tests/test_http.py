@@ -18,6 +18,7 @@ import zarr
 from asking import LONG, PACKING, TINY, Tree, final, gmsh_text, listening, service, until
 from fastapi.testclient import TestClient
 
+from frit.service.store import Store
 from frit.solver import amounts, mesh_file
 from frit.solver.case import parse_case
 from frit.solver.geometry import lattice
@@ -333,6 +334,29 @@ def test_the_history_is_that_of_the_run_as_json_and_as_csv(busy: str, data: Path
     assert "volumes" not in table[0], "a list is no scalar"
     for key in ("time", "vacancy_ratio", "neck_length"):
         assert [float(row[key]) for row in table] == [row[key] for row in rows]
+
+
+def test_a_long_history_is_never_whole_in_memory(
+    busy: str, done: Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, kinds = busy + done["links"]["history"], ("application/json", "text/csv")
+    whole = [httpx2.get(url, headers={"Accept": kind}) for kind in kinds]
+    rows = len(whole[0].json())
+    look, most = Store.history, []
+
+    def watched(store: Store, identifier: str, since: int = 0, limit: int | None = None) -> list[tuple[int, str]]:
+        found = look(store, identifier, since, limit)
+        most.append(len(found))
+        return found
+
+    monkeypatch.setattr(Store, "history", watched)
+    for few in (1, rows - 1):
+        monkeypatch.setattr("frit.service.delivery.ROWS", few)
+        for kind, before in zip(kinds, whole, strict=True):
+            answer = httpx2.get(url, headers={"Accept": kind})
+            assert (answer.text, answer.headers["content-type"]) == (before.text, before.headers["content-type"])
+            assert "etag" not in answer.headers
+        assert max(most) == few + 1
 
 
 def test_the_log_comes_in_parts(busy: str, data: Path, done: Tree) -> None:

@@ -146,7 +146,7 @@ def test_no_mpirun_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_environment_is_scrubbed_and_threads_are_one_unless_set() -> None:
-    outer = {"PMI_RANK": "3", "PMIX_ID": "x", "OMPI_COMM_WORLD_RANK": "1", "SLURM_STEP_ID": "0"}
+    outer = {"PMI_RANK": "3", "PMIX_ID": "x", "OMPI_COMM_WORLD_RANK": "1", "SLURM_STEP_ID": "0", "FRIT_TOKEN": "x"}
     clean = launch.clean_environment(
         outer | {"SLURM_JOB_ID": "7", "OMP_NUM_THREADS": "4", "OMPI_MCA_pml": "ucx", "HOME": "/root"}
     )

@@ -23,7 +23,7 @@ from frit.service import store as store_module
 from frit.service.hub import Hub
 from frit.service.jobs import Exit, Job, Move, State, TransitionError
 from frit.service.schema import jobs as table
-from frit.service.store import Key, KeyReusedError, NotFoundError, Store, StoreError, Transaction
+from frit.service.store import Key, KeyReusedError, NewPoint, NotFoundError, Store, StoreError, Transaction
 
 
 @pytest.fixture(scope="session")
@@ -576,6 +576,26 @@ def test_a_sweep_leaves_alone_what_is_under_way(store: Store) -> None:
     done(store.submit_sweep("a", "{}", points(1, 2)))
     assert store.job(running.id) == running
     assert store.job(pausing.id) == pausing
+
+
+@pytest.mark.parametrize("move", [None, Move.TIME_OUT, Move.STOP])
+def test_a_job_that_a_sweep_shares_gets_the_time_and_priority_of_the_sweep(store: Store, move: Move | None) -> None:
+    job = done(store.submit(new(1, time_limit=1e-3, priority=-5)))
+    if move is not None:
+        attempted(store, job, move)
+    sweep = done(store.submit_sweep("a", "{}", points(1)))
+    assert sweep.states == {"queued": 1}
+    (shared,) = store.jobs()
+    assert (shared.id, shared.time_limit, shared.priority) == (job.id, None, 0)
+    done(store.submit_sweep("a", "{}", [NewPoint(new(1, time_limit=9.0, priority=-9), {})]))
+    assert store.job(job.id) == shared  # nothing is taken away from whoever asked for more
+
+
+@pytest.mark.parametrize(("ranks", "state"), [(1, "failed"), (2, "queued")])
+def test_a_job_that_failed_on_few_ranks_is_tried_on_more(store: Store, ranks: int, state: str) -> None:
+    job = attempted(store, done(store.submit(new(1))), Move.FAIL)
+    done(store.submit_sweep("a", "{}", [NewPoint(new(1, ranks=ranks), {})]))
+    assert (store.job(job.id).state, store.job(job.id).ranks) == (state, ranks)
 
 
 def test_a_case_that_succeeded_once_is_not_computed_again(store: Store) -> None:

@@ -399,6 +399,14 @@ def test_what_is_looked_for_in_a_head_is_found_in_a_moment(head: bytes) -> None:
     assert subprocess.run([sys.executable, "-P", "-c", code], input=head, check=False).returncode == 0
 
 
+def test_a_cell_of_many_digits_is_looked_at_once() -> None:
+    """The interpreter is held meanwhile: nobody else is answered."""
+    began = time.process_time()
+    with pytest.raises(UnknownFileError):
+        kind_of(b"1" * 4095 + b"x")
+    assert time.process_time() - began < 0.1
+
+
 @pytest.mark.parametrize(
     "text",
     [

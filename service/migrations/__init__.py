@@ -11,6 +11,8 @@ from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
+from ..files import make_private
+
 
 class IndexVersionError(RuntimeError):
     """The index is of another version than this frit's, or no index at all."""
@@ -71,7 +73,7 @@ def upgrade(path: Path) -> Path | None:
     present, newest = versions(path)
     try:
         copy = keep(path, present) if present not in (None, newest) else None
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_private(path.parent)
         command.upgrade(configuration(path), "head")
     except (sa.exc.DatabaseError, sqlite3.Error, OSError) as error:
         words = getattr(error, "orig", error)

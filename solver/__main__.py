@@ -31,6 +31,7 @@ from .observe import Observables
 from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
+from .points import remarks
 from .prepare import build_mesh, make_integrator, prepare
 from .revision import recorded, revision_of
 from .run import Ending, RunError, piled_up, run
@@ -115,6 +116,8 @@ def execute(
         record_start(directory, asked, ranks.size, fresh, packing)
         if fresh and arguments.resume is not None:
             record_note(directory, ANEW)
+        for remark in remarks(case, mesh) if fresh else ():
+            record_note(directory, remark)
     while True:
         wall_time = kept.wall_time if kept else None
         recorder = Recorder(directory, mesh, scheme, state, identity, wall_time, requests, arguments.progress)
@@ -122,7 +125,9 @@ def execute(
             ending = run(scheme, state, integrator, recorder)
             recorder.checkpoint(scheme, state, integrator)
         except (RunError, FloatingPointError) as error:
-            return "failed", f"{error}; the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
+            recorder.snapshots.keep(state)
+            checkpoint_time = f"the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
+            return "failed", f"{error}; {checkpoint_time}, the last snapshot at {state.time:.6g}"
         finally:
             recorder.close()
         if ending is Ending.DONE:

@@ -6,6 +6,7 @@ Every figure is a float that may be infinite: what is asked for may be beyond co
 import math
 from collections.abc import Sequence
 
+POINTS = 1 / 0.72  # material points on free nodes, per mean distance of these along an axis: as many as triangles
 LOOSEST = 1e-12  # relative: round-off does not lose the last of evenly spaced times
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from . import field
 from .arrays import Floats, Numbers
 from .case import Case
 from .checkpoint import replace_durably
@@ -18,6 +19,8 @@ from .partition import Collector, Ranks
 from .state import State
 
 BLOCK = 65_536  # nodes per chunk of a snapshot
+# Of the group; those of before had no `values`, and held coefficients.
+ATTRIBUTES: dict[str, Any] = {"length_unit": "nm", "values": "fields at the nodes"}
 
 
 class DirectoryError(ValueError):
@@ -104,6 +107,7 @@ class Snapshots:
     def __init__(self, directory: Path, case: Case, mesh: Mesh, collector: Collector, fresh: bool) -> None:
         """Collective. fresh: make the group anew; else go on with the one that is there."""
         self.path, self.collector, self.ranks = directory / "snapshots.zarr", collector, collector.share.ranks
+        self.case, self.mesh = case, mesh
         if self.ranks.root and fresh:
             create_group(self.path, case, mesh, collector.block)
         elif self.ranks.root:
@@ -112,44 +116,56 @@ class Snapshots:
         self.ranks.barrier()
 
     def write(self, number: int, time: float, state: State, u: Floats) -> None:
-        """Write snapshot `number` (again, where a resumed run passes it again). Collective."""
-        particle, eta_squared = owners(u, state)
-        values = {"rho": u[:, 0], "eta_squared": eta_squared, "particle": particle}
+        """Write snapshot `number` (again, where a resumed run passes it again): the fields at the nodes. Collective."""
         first, last = self.collector.first, self.collector.last
-        for name, local in values.items():
-            block = self.collector.blocks(np.ascontiguousarray(local))
-            if last > first:
+        owner = self.collector.blocks(state.owner)
+        whole = self.collector.whole(np.ascontiguousarray(u[:, : 1 + owner.shape[1]]), everywhere=True)
+        if whole is not None and last > first:
+            values = field.at_nodes(self.case, self.mesh, slice(first, last), whole)
+            particle, eta_squared = owners(values, owner)
+            for name, block in {"rho": values[:, 0], "eta_squared": eta_squared, "particle": particle}.items():
                 grown(self.path, name, number + 1)[number, first:last] = block
         self.ranks.barrier()
         if self.ranks.root:
             self._publish(number, time)
         self.ranks.barrier()
 
+    def keep(self, state: State) -> None:
+        """Write the state of a failure in the place of the next snapshot that was asked for. Collective.
+
+        A resumed run, which gets farther, writes over it.
+        """
+        times = self.case.output.snapshot_times(self.case.time.end)
+        self.write(sum(time <= state.time for time in times), state.time, state, state.u)
+
     def _publish(self, number: int, time: float) -> None:
         import zarr
 
         names = ("rho", "eta_squared", "particle", "time")
         stored = {name: zarr.open_array(self.path, path=name, mode="r+") for name in names}
+        grown(self.path, "time", number + 1)[number] = time
         if stored["time"].shape[0] <= number:
-            grown(self.path, "time", number + 1)[number] = time
             for array in stored.values():
                 array.resize((number + 1, *array.shape[1:]))
         consolidate(self.path)  # again too, where a run was killed just before this line
 
 
-def owners(u: Floats, state: State) -> tuple[Numbers, Floats]:
-    """For each node: the particle with the largest eta where rho >= 1/2, else -1; and sum eta^2."""
-    eta = u[:, 1 : 1 + state.owner.shape[1]]
+def owners(values: Floats, owner: Numbers) -> tuple[Numbers, Floats]:
+    """For each node: the particle with the largest eta where rho >= 1/2, else -1; and sum eta^2.
+
+    values (n, 1 + slots): rho and the slots of eta, owner (n, slots).
+    """
+    eta = values[:, 1 : 1 + owner.shape[1]]
     slot = eta.argmax(axis=1)
-    particle = np.take_along_axis(state.owner, slot[:, None], axis=1)[:, 0]
-    return np.where(u[:, 0] >= 0.5, particle, -1).astype(np.int32), (eta**2).sum(axis=1)
+    particle = np.take_along_axis(owner, slot[:, None], axis=1)[:, 0]
+    return np.where(values[:, 0] >= 0.5, particle, -1).astype(np.int32), (eta**2).sum(axis=1)
 
 
 def create_group(path: Path, case: Case, mesh: Mesh, block: int) -> None:
     """An empty group with the positions of the nodes."""
     import zarr
 
-    group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"name": case.name, "length_unit": "nm"})
+    group = zarr.open_group(path, mode="w", zarr_format=3, attributes=ATTRIBUTES | {"name": case.name})
     count, dim = mesh.nodes.shape
     nodes = group.create_array(
         "nodes", shape=(count, dim), chunks=(block, dim), dtype="float64", dimension_names=("node", "axis"),

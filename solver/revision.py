@@ -10,8 +10,16 @@ from typing import Any
 Tree = Mapping[str, Any]
 FIRST = 1  # of what was computed before revisions were recorded
 
+
+def on_free_nodes(case: Tree) -> bool:
+    """Whether maximum-entropy functions stand on nodes that are no lattice."""
+    nodes, functions = case["nodes"]["source"], case["shape_functions"]["kind"]
+    return bool(nodes != "lattice" and functions == "lme")
+
+
 CHANGES: Mapping[int, Callable[[Tree], bool]] = {
     FIRST: lambda case: True,
+    2: on_free_nodes,  # points of their own, one width, projected start
 }
 REVISION = max(CHANGES)
 

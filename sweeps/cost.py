@@ -75,8 +75,21 @@ def work(case: Case) -> Work:
     """The work of a resolved case, as a tree of plain values."""
     h, size = _spacing(case), case["domain"]["size"]
     in_cell = 4 / sqrt(3) if len(size) == 2 else 4.5 * sqrt(3)  # points per h^dim of the built-in lattices
+    cells = in_cell * prod(size) / h ** len(size)
+    points = points_of(case, cells / amounts.points(1, len(size)), cells)
     rows = case["time"]["end"] / case["output"]["history_every"]
-    return Work(in_cell * prod(size) / h ** len(size), nodes_in_range(case), _live(case), evaluations(case), rows)
+    return Work(points, nodes_in_range(case, h), _live(case), evaluations(case), rows)
+
+
+def points_of(case: Case, nodes: float, cells: float) -> float:
+    """Material points on that many nodes with that many cells: one in each, or on a lattice of their own."""
+    size, points = case["domain"]["size"], case.get("points", {})  # which cases of old have not
+    on_mesh = case["nodes"]["source"] == "lattice" or case["shape_functions"]["kind"] == "linear"
+    if on_mesh or points.get("source") == "cells":
+        return cells
+    if (pitch := points.get("pitch")) is not None:
+        return prod(amounts.quotient(length, pitch) for length in size)
+    return nodes * amounts.POINTS ** len(size)
 
 
 def evaluations(case: Case) -> float:
@@ -112,11 +125,12 @@ def _spacing(case: Case) -> float:
     return float(case["nodes"].get("spacing") or min(case["domain"]["size"]) / 50)
 
 
-def nodes_in_range(case: Case) -> float:
-    """Nodes within h sqrt(-ln(delta_0) / gamma) of a point; the corners of a cell with linear functions."""
-    dim, reach = len(case["domain"]["size"]), _reach(case["shape_functions"])
-    if case["shape_functions"]["kind"] == "linear":
+def nodes_in_range(case: Case, spacing: float) -> float:
+    """Nodes, so far from each other, within h sqrt(-ln(delta_0) / gamma) of a point; of linear functions, of a cell."""
+    dim, shape = len(case["domain"]["size"]), case["shape_functions"]
+    if shape["kind"] == "linear":
         return dim + 1.0
+    reach = _reach(shape) * (shape.get("width") or spacing) / spacing
     return pi * reach**2 * 2 / sqrt(3) if dim == 2 else 4 / 3 * pi * reach**3 * 0.75 * sqrt(3)
 
 
@@ -273,7 +287,8 @@ def busy(case: Case) -> dict[str, float]:
     """Ranks, and the part of their time that is work, for a resolved case; see `scaling`."""
     said, size = work(case), tuple(case["domain"]["size"])
     nodes = said.points / (2 if len(size) == 2 else 6)  # of the built-in lattices
-    reach, particles = _reach(case["shape_functions"]) * _spacing(case), _particles(case["particles"], len(size))
+    shape = case["shape_functions"]
+    reach, particles = _reach(shape) * (shape.get("width") or _spacing(case)), _particles(case["particles"], len(size))
     found = efficiencies(size, nodes, reach, said.evaluation(), particles)
     return {str(ranks): part for ranks, part in found.items()}
 

@@ -120,7 +120,7 @@ def test_few_rows_of_nodes_give_the_degree_that_they_determine(height: float, de
 def test_a_single_cell_integrates_linear_fields() -> None:
     nodes = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
     cells = np.arange(3, dtype=np.int32)[None]
-    mesh = Mesh(nodes, cells, nodes.mean(axis=0)[None], np.array([8.0]), np.array([4.0]))
+    mesh = Mesh(nodes, cells, nodes.mean(axis=0)[None], np.array([8.0]), np.array([4.0]), 4.0, True)
     low, high = np.array([0.5, 0.7]), np.array([1.5, 1.2])
     assert error(mesh, low, high, polynomial(1, (4.0, 4.0), seed=1), False) < 1e-13
 

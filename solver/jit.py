@@ -91,7 +91,8 @@ def seed(folder: Path) -> None:
 numba.config.CACHE_DIR = str(trusted_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-OPTIONS: dict[str, Any] = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
+EXACT: dict[str, Any] = {"cache": True, "error_model": "numpy"}
+OPTIONS: dict[str, Any] = EXACT | {"fastmath": FASTMATH}
 
 
 def jit(function: Function) -> Function:
@@ -102,3 +103,13 @@ def jit(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """`jit` for the innermost functions: a call that passes five arrays costs as much as the loop inside."""
     return cast(Function, numba.njit(forceinline=True, **OPTIONS)(function))
+
+
+def exact(function: Function) -> Function:
+    """`jit` where every operation is done as written: every processor gives the same numbers, to the last bit."""
+    return cast(Function, numba.njit(**EXACT)(function))
+
+
+def exact_inlined(function: Function) -> Function:
+    """`inlined`, likewise."""
+    return cast(Function, numba.njit(forceinline=True, **EXACT)(function))

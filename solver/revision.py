@@ -20,6 +20,7 @@ def on_free_nodes(case: Tree) -> bool:
 CHANGES: Mapping[int, Callable[[Tree], bool]] = {
     FIRST: lambda case: True,
     2: on_free_nodes,  # points of their own, one width, projected start
+    3: lambda case: bool(case["particles"]["source"] == "packing"),  # the same packing on every processor
 }
 REVISION = max(CHANGES)
 

@@ -282,7 +282,9 @@ async def submit_sweep(
         async with engine.shelf.taken(submission.files) as uploads:
             new = await asyncio.to_thread(admission.sweep_of, submission, engine.settings, uploads)
             request.app.state.queue.admit(len(new.points))
-            queued = store.submit_sweep(new.name, new.definition, new.points, new.duplicates, key)
+            queued = store.submit_sweep(
+                new.name, new.definition, new.points, new.duplicates, key, submission.recompute
+            )
             sweep = await asyncio.wrap_future(queued)
     view = views.sweep_view(sweep, store.new_in_sweeps([sweep.seq])[sweep.seq])
     return made(view, f"/v1/sweeps/{sweep.id}")

@@ -83,10 +83,12 @@ class Client:
     def submit(
         self, what: str | Path | Mapping[str, Any], *, ranks: int | None = None, name: str | None = None,
         priority: int | None = None, tags: Sequence[str] | None = None, time_limit: float | None = None,
+        recompute: bool = False,
     ) -> "RemoteJob | RemoteSweep":  # fmt: skip
         """Submit a case, or a sweep, which has a base: a TOML or JSON file, or a tree of plain values.
 
-        Mesh and particle files that it names are read here and sent along. time_limit: wall-clock seconds.
+        Mesh and particle files that it names are read here and sent along. time_limit: wall-clock seconds. recompute:
+        of a sweep also what an older revision of the solver computed; a case is computed at any rate.
         Raises `CaseError` for what is wrong here already, `ProblemError` for what the service refuses.
         """
         from frit.solver.case import read_tree
@@ -97,7 +99,7 @@ class Client:
         given = {key: value for key, value in options.items() if value is not None}
         given |= {} if tags is None else {"tags": list(tags)}
         if isinstance(tree, Mapping) and "base" in tree:
-            return self._submit_sweep(tree, folder, given)
+            return self._submit_sweep(tree, folder, given | ({"recompute": True} if recompute else {}))
         return self._submit_case(tree, folder, given)
 
     def submit_sweep(self, definition: str | Path | Mapping[str, Any], **options: Any) -> "RemoteSweep":

@@ -12,7 +12,7 @@ import typer
 
 from frit.solver.characters import visible
 
-from .words import AsJson, DataFolder, SweepFile, fail, refuse, show_table
+from .words import AsJson, DataFolder, Recompute, SweepFile, fail, of_older, refuse, show_table
 
 if TYPE_CHECKING:
     from .client import Client, RemoteJob
@@ -80,6 +80,7 @@ def submit(
     priority: Annotated[int | None, typer.Option(help="Higher comes first; default 0.")] = None,
     tag: Annotated[list[str] | None, typer.Option(help="May be given several times.")] = None,
     time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Wall-clock time of an attempt.")] = None,
+    recompute: Recompute = False,
     wait: Annotated[bool, typer.Option("--wait", help="Stay to the end; exit status 1 unless all succeed.")] = False,
     url: Url = HERE,
     token: Secret = None,
@@ -91,7 +92,7 @@ def submit(
     options = {"ranks": ranks, "name": name, "priority": priority, "tags": tag or None, "time_limit": time_limit}
     with speaking(url, token, str(file)) as client:
         given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
-        submitted = client.submit(file, **given)
+        submitted = client.submit(file, recompute=recompute, **given)
         if wait:
             submitted.wait()
         found = [submitted] if isinstance(submitted, RemoteJob) else list(submitted.jobs())
@@ -222,10 +223,13 @@ def compare(
                 "time": c["time"][-1] if c["time"] else None,
                 f"{observable} first": c["values"][0] if c["values"] else None,
                 f"{observable} last": c["final"],
+                "revision": c["older"],
             }
             for c in found["curves"]
         ]
     )
+    if note := of_older([c["older"] for c in found["curves"]]):
+        typer.echo(note)
     typer.echo("Compare packs of equal size: with rigid motion, shrinkage depends on the number of particles.")
     if out is not None:
         typer.echo(f"{out}: curves")

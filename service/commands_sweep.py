@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from .words import AsJson, DataFolder, SweepFile, in_words, refuse, show_table
+from .words import AsJson, DataFolder, Recompute, SweepFile, in_words, of_older, refuse, show_table
 
 app = typer.Typer(no_args_is_help=True, help="Sweeps over packings: what they cost, and running them without a server.")
 
@@ -21,7 +21,9 @@ WIDEST = 44  # characters of a name in a table
 
 
 @app.command()
-def plan(file: SweepFile, data: DataFolder = Path("data"), as_json: AsJson = False) -> None:
+def plan(
+    file: SweepFile, data: DataFolder = Path("data"), recompute: Recompute = False, as_json: AsJson = False
+) -> None:
     """Points, duplicates, what is done already, and the core-hours that the rest will take."""
     from frit.sweeps.cost import Measured
     from frit.sweeps.cost import plan as make_plan
@@ -29,14 +31,16 @@ def plan(file: SweepFile, data: DataFolder = Path("data"), as_json: AsJson = Fal
     from .store import Store
 
     expansion = expanded(file)[1]
-    past, done = list[Measured](), set[str]()
+    past, done, older = list[Measured](), set[str](), dict[str, int]()
     if (data / "frit.db").exists():
         store = Store(data, writable=False)
         past = [Measured(json.loads(case), seconds) for case, seconds in store.measured()]
         identities = [point.identity for point in expansion.points]
-        done = {identity for identity, job in store.identities(identities).items() if job.state == "succeeded"}
+        known = store.identities(identities, recompute).items()
+        done = {identity for identity, job in known if job.state == "succeeded"}
+        older = {identity: job.older for identity, job in known if identity in done and job.older is not None}
         store.close()
-    made = make_plan(expansion, past, done)
+    made = make_plan(expansion, past, done - older.keys(), older)
     if as_json:
         typer.echo(json.dumps(made.as_dict(), indent=2))
         return
@@ -49,6 +53,7 @@ def run(
     file: SweepFile,
     data: DataFolder = Path("data"),
     cores: Annotated[int | None, typer.Option(metavar="N", min=1, help="Cores; default: all of this process.")] = None,
+    recompute: Recompute = False,
     as_json: AsJson = False,
 ) -> None:
     """Run what is missing of a sweep here; Ctrl-C writes checkpoints, and the same command goes on."""
@@ -60,13 +65,15 @@ def run(
     if sweep.ranks > settings.cores:
         refuse(f"{file}: ranks = {sweep.ranks}: must be at most the {settings.cores} cores that there are (--cores)")
     try:
-        status, rows = asyncio.run(run_here(settings, sweep, expansion))
+        status, rows = asyncio.run(run_here(settings, sweep, expansion, recompute))
     except EngineError as error:
         refuse(str(error))
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
         show_table(rows)
+        if note := of_older([row["older_revision"] for row in rows]):
+            typer.echo(note)
         typer.echo(f"run directories: {settings.runs}/")
         if status == 130:
             typer.echo("interrupted; the same command goes on", err=True)
@@ -86,12 +93,14 @@ def expanded(file: Path) -> tuple[Any, Any]:
         refuse(*(f"{file}: {line}" for line in str(error).splitlines()))
 
 
-async def run_here(settings: Any, sweep: Any, expansion: Any) -> tuple[int, list[dict[str, Any]]]:
+async def run_here(
+    settings: Any, sweep: Any, expansion: Any, recompute: bool = False
+) -> tuple[int, list[dict[str, Any]]]:
     """Submit the sweep to an engine of our own and stay to its end; exit status and a row per job."""
     from .engine import Engine
 
     async with Engine(settings) as engine:
-        record = await engine.submit_sweep(sweep, expansion)
+        record = await engine.submit_sweep(sweep, expansion, recompute=recompute)
         stopped = await follow(engine, record.id)
         rows = rows_of(engine.store, record.id)
     failed = any(row["state"] != "succeeded" for row in rows)
@@ -158,6 +167,7 @@ def rows_of(store: Any, sweep: str) -> list[dict[str, Any]]:
                 "vacancy_end": job.result.get("vacancy_ratio"),
                 "particles": job.result.get("particles"),
                 "core_seconds": job.core_seconds,
+                "older_revision": job.older,
                 "message": job.message,
             }
         )

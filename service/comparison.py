@@ -29,7 +29,7 @@ def compare(store: Store, sweep: SweepRecord, observable: str) -> views.Comparis
                 job=point.job.id, name=point.name, state=point.job.state,
                 parameters={name: point.parameters.get(name) for name in differing},
                 time=[time for time, _ in curve], values=[value for _, value in curve],
-                final=curve[-1][1] if curve else None,
+                final=curve[-1][1] if curve else None, older=point.job.older,
             )
         )  # fmt: skip
     return views.Comparison(sweep=sweep.id, observable=observable, differing=differing, curves=shown)

@@ -93,13 +93,15 @@ class Engine:
             await self.scheduler.stop(job, "cancelled")
         return job
 
-    async def submit_sweep(self, sweep: "Sweep", expansion: "Expansion", key: Key | None = None) -> SweepRecord:
-        """Queue what is missing of a sweep."""
+    async def submit_sweep(
+        self, sweep: "Sweep", expansion: "Expansion", key: Key | None = None, recompute: bool = False
+    ) -> SweepRecord:
+        """Queue what is missing of a sweep; recompute: also what another revision of the solver computed."""
         points = [
             NewPoint(NewJob(p.case, p.identity, p.name, sweep.ranks, sweep.priority, sweep.tags), p.parameters)
             for p in expansion.points
         ]
-        made = self.store.submit_sweep(sweep.name, sweep.resolved_json(), points, expansion.duplicates, key)
+        made = self.store.submit_sweep(sweep.name, sweep.resolved_json(), points, expansion.duplicates, key, recompute)
         return await asyncio.wrap_future(made)
 
     def trouble(self) -> str | None:

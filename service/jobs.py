@@ -1,10 +1,13 @@
 """Jobs: their states, one sentence each, the moves between them, and the records that travel through the service."""
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
+
+from frit.solver.revision import revision_of
 
 LONGEST_MESSAGE = 500  # characters
 PATH = re.compile(r"(?<![^\s'\"`(=:,])/(?:[^\s'\"`(),:;/]+/)+(?=[^\s'\"`(),:;/])")  # all but its last name
@@ -148,8 +151,14 @@ class Job:
     started: float | None
     ended: float | None
     core_seconds: float | None  # of all attempts
-    result: dict[str, Any]  # scalars of the last history row; `packing`: what was realised
+    result: dict[str, Any]  # scalars of the last history row; `packing`: what was realised; `revision` of the results
     case: str
+
+    @property
+    def older(self) -> int | None:
+        """The revision that computed what there is, where this solver has another for such a case."""
+        revision: int | None = self.result.get("revision")
+        return None if revision in (None, revision_of(json.loads(self.case))) else revision
 
     @property
     def final(self) -> bool:

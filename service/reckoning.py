@@ -2,9 +2,9 @@
 
 Memory was measured as the largest resident set of the ranks (2 particles; one rank unless said): lattices 2-D 451 000
 nodes 0.98 GB, 72 000 nodes at gamma 0.5 0.43 GB; 3-D 94 000 nodes 0.80 GB, 258 000 nodes 1.77 GB, 94 000 nodes at gamma
-0.5 3.1 GB; meshes of gmsh 2-D 72 000 nodes 0.43 GB, 3-D 20 000 nodes 0.82 GB, 94 000 as reckoned (54 000 in truth) 3.0
-GB. Packs: 144 discs on 212 000 nodes 0.62 GB, 27 spheres on 94 000 nodes 0.90 GB. Two ranks with 212 000 nodes of 2-D:
-0.88 GB together. So
+0.5 3.1 GB; meshes of gmsh 3-D 23 000 nodes as reckoned (13 800 in truth) 0.57 GB, with points in cells 0.85 GB, 102 000
+(59 600) 1.75 GB. Packs: 144 discs on 212 000 nodes 0.62 GB, 27 spheres on 94 000 nodes 0.90 GB. Two ranks with 212 000
+nodes of 2-D: 0.88 GB together. So
 
     memory = ranks RANK + nodes (NODE + SLOT (slots beyond SLOTS)) + pairs PAIR
 
@@ -18,13 +18,14 @@ from typing import Any
 
 from frit.solver import amounts
 from frit.solver.mesh_file import MeshFileError, shapes
-from frit.sweeps.cost import nodes_in_range
+from frit.sweeps.cost import factored, nodes_in_range, points_of
 
 from .settings import Settings
 
 RANK = 450e6  # bytes: interpreter, libraries, compiled code and the compiler
 NODE = 1600.0  # bytes per node: fields, numbers of the integrator, mesh
-PAIR = {"lattice": 6.0, "gmsh": 40.0, "file": 75.0}  # bytes: on lattices few are kept; of gmsh more nodes are reckoned
+FACTORED = 900.0  # bytes per node of a square or cubic lattice, which has no mesh and no table of neighbours
+PAIR = {"lattice": 6.0, "triangular": 6.0, "gmsh": 40.0, "file": 75.0}  # bytes: on lattices few are kept; of gmsh more nodes are reckoned
 SLOTS = 6  # order parameters per node that NODE has
 MANY_SLOTS = {2: 8, 3: 24}  # as many as shared slots get to: 6 in 2-D with 144 particles, 21 in 3-D with 150
 SLOT = 100.0  # bytes per node and further slot
@@ -67,8 +68,10 @@ def need(case: Tree, ranks: int) -> Need:
     snapshots = snapshots_of(output["snapshots"], end)
     shared = case["activation"]["few_order_parameters"]
     slots = min(particles, MANY_SLOTS[dim]) if shared else particles
-    pairs = points * nodes_in_range(case)
-    memory = nodes * (NODE + SLOT * max(slots - SLOTS, 0)) + pairs * PAIR[case["nodes"]["source"]]
+    apart = case["nodes"].get("spacing") or (math.prod(case["domain"]["size"]) / max(nodes, 1.0)) ** (1.0 / dim)
+    pairs = points * nodes_in_range(case, apart)
+    each, pair = (FACTORED, 0.0) if factored(case) else (NODE, PAIR[case["nodes"]["source"]])
+    memory = nodes * (each + SLOT * max(slots - SLOTS, 0)) + pairs * pair
     checkpoint = nodes * (16 + 24 * max(slots, SLOTS))
     disk = (ROW + ROW_PARTICLE * particles) * rows + SNAPSHOT * nodes * snapshots + 2 * checkpoint + MESH * nodes
     return Need(nodes, points, particles, rows, snapshots, ranks * RANK + memory, disk)
@@ -78,13 +81,15 @@ def mesh_of(case: Tree) -> tuple[float, float]:
     """Nodes and material points: reckoned of a lattice or gmsh, told by frit's own mesh file."""
     size, given = case["domain"]["size"], case["nodes"]
     if given["source"] != "file":
-        nodes = amounts.nodes(size, given["spacing"])
-        return nodes, amounts.points(nodes, len(size))
+        nodes = amounts.nodes(size, given["spacing"], given["source"])
+        cells = amounts.points(nodes, len(size))
+        return nodes, points_of(case, nodes, cells)
     try:
         found = shapes(given["path"])
     except (OSError, MeshFileError):
         return 0.0, 0.0  # the ranks will say so
-    return float(found.nodes), float(found.cells["triangle" if len(size) == 2 else "tetra"])
+    nodes, cells = float(found.nodes), float(found.cells["triangle" if len(size) == 2 else "tetra"])
+    return nodes, points_of(case, nodes, cells)
 
 
 def particles_of(given: Tree) -> float:
@@ -109,6 +114,9 @@ def excesses(case: Tree, ranks: int, settings: Settings) -> Iterator[Excess]:
     """All that a case has too much of for this service."""
     asked = need(case, ranks)
     spacing = blamed = _spacing(case)
+    for table, key in (("points", "pitch"), ("shape_functions", "width")):
+        if (given := case[table].get(key)) is not None:
+            blamed = f"{table}.{key}", given
     if not case["activation"]["few_order_parameters"] and asked.particles > MANY_SLOTS[3]:
         blamed = ("activation.few_order_parameters", False)
     if asked.nodes > settings.nodes_limit:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from frit.solver.case import Case, parse_case
+from frit.solver.revision import recorded
 
 from .files import read_json
 from .jobs import Job
@@ -75,14 +76,15 @@ class Reader:
         return list(enumerate(self._times))[first:count]
 
     def result(self) -> dict[str, Any]:
-        """The scalars of the last history row, and what a packing realised."""
+        """The scalars of the last history row, what a packing realised, and the revision that computed it all."""
         lines = (self.directory / "history.jsonl").read_bytes().split(b"\n") if self.place.rows else []
         if len(lines) > 1:
             check_row(self.directory / "history.jsonl", len(lines) - 2, lines[-2].decode())
         last: dict[str, Any] = json.loads(lines[-2]) if len(lines) > 1 else {}
         scalars = {key: value for key, value in last.items() if isinstance(value, int | float)}
-        packing = read_json(self.directory / "run.json").get("packing")
-        return {**scalars, **({"packing": packing} if packing else {})}
+        record = read_json(self.directory / "run.json")
+        more = {"packing": record.get("packing"), "revision": recorded(record)}
+        return scalars | {key: value for key, value in more.items() if value}
 
 
 def check_row(path: Path, number: int, line: str) -> None:

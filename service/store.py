@@ -24,6 +24,8 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Engine, Row
 from sqlalchemy.exc import DBAPIError
 
+from frit.solver.revision import REVISION, revision_of
+
 from . import migrations
 from .files import flush_folder
 from .jobs import Exit, Job, Move, NewJob, State, TransitionError, after
@@ -34,7 +36,6 @@ ASKED = 16  # indices that questions have made, at most
 FEW = 2000  # jobs that are sorted rather than walked along
 BUSY = 5.0  # seconds to wait for a lock that another program holds
 UPLOADED = re.compile(r"\b[0-9a-f]{64}\.[a-z]+")  # the name of an uploaded file
-SUCCEEDED = 1 << 60  # more than any seq
 TROUBLE = {  # primary codes of SQLite's that tell of the database and its disk, not of one statement
     sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR,
     sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PROTOCOL,
@@ -374,16 +375,20 @@ class Store:
         return self._put(_Share(_submit, _Submission(job, key), Future()))
 
     def submit_sweep(
-        self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
-    ) -> "Future[SweepRecord]":
-        """Queue the points of a sweep that no job has yet; jobs of the same case that were not done are tried again."""
+        self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None,
+        recompute: bool = False,
+    ) -> "Future[SweepRecord]":  # fmt: skip
+        """Queue the points of a sweep that no job has yet; jobs of the same case that were not done are tried again.
+
+        recompute: what another revision of the solver computed does not count.
+        """
 
         def effect(t: Transaction) -> SweepRecord:
             if (known := _known(t, key)) is not None:
                 return _sweep(t.connection, known)
             row = _insert_sweep(t, name, definition, duplicates)
             seq, identifier = row["seq"], row["id"]
-            numbers = _jobs_of_points(t, points)
+            numbers = _jobs_of_points(t, points, recompute)
             members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
             t.note("sweep", **row, points=members)
             rows = [
@@ -708,10 +713,11 @@ class Store:
         with self.reading() as connection:
             return [row.key for row in connection.execute(query)]
 
-    def identities(self, which: Sequence[str]) -> dict[str, Job]:
-        """Of these identities, the newest job each has."""
+    def identities(self, which: Sequence[str], recompute: bool = False) -> dict[str, Job]:
+        """Of these identities, the job of each that a sweep would share; `recompute` as in `submit_sweep`."""
         with self.reading() as connection:
-            return {identity: _by_seq(connection, seq) for identity, seq in _existing(connection, which).items()}
+            found = _existing(connection, which, recompute)
+            return {identity: _by_seq(connection, seq) for identity, seq in found.items()}
 
     def known(self, key: Key) -> str | None:
         """The id of what a key made before. Raises `KeyReusedError`."""
@@ -853,6 +859,11 @@ COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
 LISTS = ("$.particles.centres", "$.particles.radii", "$.particles.sizes")  # most of a large case
 WITHOUT = sa.func.json_remove(jobs.c.case, *LISTS).label("case")
 BRIEF = [WITHOUT if column.name == "case" else column for column in jobs.c]
+MADE_BY = sa.func.json_extract(jobs.c.result, "$.revision").label("revision")
+USEFUL = [  # what tells whether a job is of use to a sweep; the case where the revision does not tell all
+    jobs.c.seq, jobs.c.identity, jobs.c.state, jobs.c.retrying, MADE_BY,
+    sa.case((MADE_BY != REVISION, WITHOUT)).label("case"),
+]  # fmt: skip
 
 
 def _unpacked(values: dict[str, Any]) -> Job:
@@ -1091,23 +1102,34 @@ def _existing_ids(t: Transaction, which: Sequence[str]) -> dict[str, int]:
     return found
 
 
-def _existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
-    """The seq of a job of each identity: of one that succeeded, if any did, else of the newest."""
-    done = sa.case((jobs.c.state == State.SUCCEEDED, SUCCEEDED), else_=0)
-    found: dict[str, int] = {}
+def _existing(connection: Connection, which: Sequence[str], recompute: bool = False) -> dict[str, int]:
+    """The seq of a job of each identity that has one of use: the best, and of equals the newest."""
+    best: dict[str, tuple[int, int]] = {}
     for k in range(0, len(which), 500):
-        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq + done)).where(jobs.c.identity.in_(which[k : k + 500]))
-        found |= {identity: seq % SUCCEEDED for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
-    return found
+        for row in connection.execute(sa.select(*USEFUL).where(jobs.c.identity.in_(which[k : k + 500]))):
+            rank = _use(State(row.state), row.retrying, row.revision, row.case, recompute), row.seq
+            best[row.identity] = max(best.get(row.identity, (0, 0)), rank)
+    return {identity: seq for identity, (use, seq) in best.items() if use}
 
 
-def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
+def _use(state: State, retrying: bool, revision: int | None, case: str | None, recompute: bool) -> int:
+    """Of what use a job is to whoever wants its case computed: 0 none, 3 all.
+
+    What another revision computed stands in, unless it is to be computed anew; where it failed, this one may not.
+    """
+    going = retrying or state is State.QUEUED or state.active
+    if case is not None and revision != revision_of(json.loads(case)):
+        return 0 if recompute or not (going or state is State.SUCCEEDED) else 2
+    return 3 if state is State.SUCCEEDED else 2 if going else 1
+
+
+def _jobs_of_points(t: Transaction, points: Sequence[NewPoint], recompute: bool = False) -> dict[str, int]:
     """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done.
 
     Whoever queued the old one may have wished for less: it gets the priority, the time and the ranks asked for now.
     """
     asked = {point.job.identity: point.job for point in points}
-    numbers = _existing(t.connection, list(asked))
+    numbers = _existing(t.connection, list(asked), recompute)
     old = list(numbers.values())
     undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
     waiting = (jobs.c.state == State.QUEUED) | jobs.c.retrying

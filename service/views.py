@@ -87,6 +87,7 @@ class SweepSubmission(Body):
     tags: Tags | None = None
     time_limit: Limit | None = None
     files: Files = {}
+    recompute: Annotated[bool, Field(strict=True, description="Compute anew what an older solver computed.")] = False
 
 
 class AttemptView(BaseModel):
@@ -182,7 +183,10 @@ class SweepPage(BaseModel):
 
 
 class Curve(BaseModel):
-    """An observable of one job over model time. `parameters`: those that differ within the sweep."""
+    """An observable of one job over model time. `parameters`: those that differ within the sweep.
+
+    `older`: the revision of the solver that computed it, where it is not the present one's.
+    """
 
     job: str
     name: str
@@ -191,6 +195,7 @@ class Curve(BaseModel):
     time: list[float]
     values: list[float | None]
     final: float | None
+    older: int | None
 
 
 class Comparison(BaseModel):

@@ -18,6 +18,19 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DataFolder = Annotated[
     Path, typer.Option("--data", metavar="DIR", file_okay=False, envvar="FRIT_DATA", help="Data folder.")
 ]
+Recompute = Annotated[
+    bool, typer.Option("--recompute", help="Compute anew what an older revision of the solver computed.")
+]
+
+
+def of_older(revisions: Sequence[int | None]) -> str | None:
+    """A sentence on the jobs that an older revision of the solver computed; None stands for each of the others."""
+    found = [revision for revision in revisions if revision is not None]
+    if not found:
+        return None
+    which = ", ".join(map(str, sorted(set(found))))
+    many = f"{len(found)} of {len(revisions)} jobs were computed by an older revision of the solver ({which})"
+    return f"{many}, whose results differ: --recompute, with the sweep's file, computes them anew."
 
 
 def refuse(*lines: str) -> NoReturn:

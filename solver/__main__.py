@@ -30,6 +30,7 @@ from .integrators import Integrator
 from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
+from .revision import recorded, revision_of
 from .run import Ending, RunError, piled_up, run
 from .setup import Setup, make_setup
 from .shape import ShapeError
@@ -39,6 +40,7 @@ REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
 SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
 ANEW = "it was stopped before its first checkpoint: begun anew from case.json"
+MIXED = "begun by revision {before} of the solver, gone on with by revision {now}: it counts as of the older one"
 EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
@@ -111,6 +113,8 @@ def execute(
         record_start(directory, asked, ranks.size, fresh, packing)
         if fresh and arguments.resume is not None:
             record_note(directory, ANEW)
+        for remark in setup.remarks() if fresh else ():
+            record_note(directory, remark)
     while True:
         wall_time = kept.wall_time if kept else None
         recorder = Recorder(directory, setup, scheme, state, identity, wall_time, requests, arguments.progress)
@@ -118,7 +122,9 @@ def execute(
             ending = run(scheme, state, integrator, recorder)
             recorder.checkpoint(scheme, state, integrator)
         except (RunError, FloatingPointError) as error:
-            return "failed", f"{error}; the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
+            recorder.keep(scheme, state)
+            checkpoint_time = f"the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
+            return "failed", f"{error}; {checkpoint_time}, the last snapshot at {state.time:.6g}"
         finally:
             recorder.close()
         if ending is Ending.DONE:
@@ -206,7 +212,13 @@ class Recorder:
 
     def snapshot(self, number: int, system: System, state: Progress, u: Floats, time_: float) -> None:
         """Write a snapshot."""
-        self.snapshots.write(number, time_, *self.setup.nodal(system, state, u))
+        self.snapshots.write(number, time_, self.setup.fields(system, state, u, self.collector))
+
+    def keep(self, system: System, state: Progress) -> None:
+        """Write the state of a failure in the place of the next snapshot; a resumed run, which gets farther, does so
+        again."""
+        u = system.at(state, system.vector(state))
+        self.snapshot(self.snapshots.next(state.time), system, state, u, state.time)
 
     def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
         """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
@@ -259,14 +271,18 @@ class Recorder:
 def record_start(
     directory: Path, case: Case, ranks: int, fresh: bool, packing: dict[str, Any] | None = None
 ) -> None:
-    """run.json: what runs here, with which versions and packing, since when. A resumed run keeps the first start."""
+    """run.json: what runs here, with which versions and packing, since when. A resumed run keeps the first start, and
+    the oldest revision of the results that had a part in it.
+    """
     path = directory / "run.json"
     before = json.loads(path.read_text()) if path.exists() and not fresh else {}
+    now, begun = revision_of(case.tree()), recorded(before)
     record = {
         "state": "running",
         "message": None,
         "retry": False,
         "case": case.identity(),
+        "revision": now if begun is None else min(begun, now),
         "name": case.name,
         "ranks": ranks,
         "host": socket.gethostname(),
@@ -279,6 +295,8 @@ def record_start(
         "end": None,
     }
     output.write_json(path, record)
+    if begun is not None and begun != now:
+        record_note(directory, MIXED.format(before=begun, now=now))
 
 
 def record_end(

@@ -6,6 +6,7 @@ Every figure is a float that may be infinite: what is asked for may be beyond co
 import math
 from collections.abc import Sequence
 
+POINTS = 1 / 0.72  # material points on free nodes, per mean distance of these along an axis: as many as triangles
 LOOSEST = 1e-12  # relative: round-off does not lose the last of evenly spaced times
 
 
@@ -14,11 +15,13 @@ def quotient(a: float, b: float) -> float:
     return a / b if b > 0.0 else math.inf
 
 
-def nodes(size: Sequence[float], spacing: float) -> float:
-    """Nodes of the lattice of nearest neighbours h in the box, its walls included; of gmsh about as many.
+def nodes(size: Sequence[float], spacing: float, source: str = "triangular") -> float:
+    """Nodes of a lattice of nearest neighbours h in the box, its walls included; of gmsh about as many as triangular.
 
-    Triangular: rows h sqrt(3)/2 apart; body-centred: two per cube of edge 2h / sqrt(3).
+    lattice: square or cubic. Triangular: rows h sqrt(3)/2 apart; body-centred: two per cube of edge 2h / sqrt(3).
     """
+    if source == "lattice":
+        return math.prod(quotient(length, spacing) + 1 for length in size)
     pitch = [spacing, spacing * math.sqrt(3) / 2] if len(size) == 2 else [2 * spacing / math.sqrt(3)] * 3
     counts = [quotient(length, step) + 1 for length, step in zip(size, pitch, strict=True)]
     return math.prod(counts) * (1 if len(size) == 2 else 2)

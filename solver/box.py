@@ -1,6 +1,8 @@
-"""The integral of a field over a box from its values at the nodes: a quadrature rule that is exact for cubics.
+"""The integral of a field over a box: quadrature rules that are exact for cubics.
 
-Around every node a lies a cubic p_a, fitted to the values f_b of the nodes near by (moving least squares):
+On free nodes a rule takes the field where it likes: `gauss_rule`. On a lattice, and with linear functions, nodal values
+count as samples of something smooth. Around every node a lies a cubic p_a, fitted to the values f_b of the nodes near
+by (moving least squares):
 
     p_a(x) = P(x - x_a) . c_a,  G_a c_a = sum_b W_ab P(x_b - x_a) f_b,  G_a = sum_b W_ab P(x_b - x_a) P(x_b - x_a)^T
 
@@ -24,6 +26,7 @@ from .geometry import Mesh
 from .jit import jit
 from .partition import Ranks
 
+GAUSS = 3.0**-0.5  # Gauss's two points in [-1, 1]
 DEGREE = 3  # of the fits
 REACH = 2.0  # in local nodal spacings: beyond, fits smooth what is 1 spacing wide; below, they have too few nodes
 WIDER = 1.25  # factor on a reach whose nodes do not determine a polynomial,
@@ -72,6 +75,21 @@ def box_weights(mesh: Mesh, low: Floats, high: Floats, regular: bool, ranks: Ran
     add_fits(weights, mesh, low, high, spacing, wanted & share_of(wanted & (depth > 0.0), ranks))
     ranks.sum(weights)
     return np.where(deep, volumes, weights)
+
+
+def gauss_rule(low: Floats, high: Floats, steps: Floats) -> tuple[Floats, Floats]:
+    """Points (q, dim) and weights (q,) of a rule on a box that is exact for cubics: Gauss's, two points along each axis
+    in each interval between multiples of that axis's step.
+    """
+    points, weights = [], []
+    for a, b, step in zip(low, high, steps, strict=True):
+        inner = step * np.arange(np.ceil(a / step), np.floor(b / step) + 1)
+        ends = np.concatenate([[a], inner[(inner > a + 1e-9 * step) & (inner < b - 1e-9 * step)], [b]])
+        middles, halves = 0.5 * (ends[1:] + ends[:-1]), 0.5 * np.diff(ends)
+        points.append(np.add.outer(middles, np.zeros(2)).ravel() + np.outer(halves, [-GAUSS, GAUSS]).ravel())
+        weights.append(np.repeat(halves, 2))
+    place = np.stack(np.meshgrid(*points, indexing="ij"), axis=-1).reshape(-1, len(points))
+    return place, np.prod(np.stack(np.meshgrid(*weights, indexing="ij"), axis=-1).reshape(-1, len(points)), axis=1)
 
 
 def share_of(nodes: Flags, ranks: Ranks) -> Flags:

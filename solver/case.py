@@ -48,6 +48,7 @@ from .particle_file import ParticleFileError
 
 CANONICAL = json.JSONEncoder(sort_keys=True)
 PLAIN = {"tuple_type": "must be a list", "model_type": "must be a table", "dict_type": "must be a table"}
+MOST_POINTS = 500_000_000  # 36 GB for their places alone
 ROUND_OFF = 1e-9  # relative: what only touches a limit keeps it
 SMALLEST, LARGEST = 1e-30, 1e30  # sizes of numbers: products of a few neither vanish nor overflow
 LONGEST_KEY = 100  # characters of an unknown key that are compared with known ones
@@ -168,13 +169,16 @@ class Table(BaseModel):
 
     `owned` has the fields that go with each setting of the `switches`: `...` for one that must be given, else
     its default. Those that go with another setting only are refused. `alone` names fields of which the table checks
-    whether they are given, but never their value against another field's.
+    whether they are given, but never their value against another field's. `added` has the defaults of fields that came
+    after the first release of identities: at its default such a field is no part of the identity, which old cases so
+    keep. A field is not in both.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
     switches: ClassVar[tuple[str, ...]] = ()
     owned: ClassVar[Mapping[tuple[str, ...], Mapping[str, Any]]] = {(): {}}
     alone: ClassVar[tuple[str, ...]] = ()
+    added: ClassVar[Mapping[str, Any]] = {}
 
     @model_validator(mode="wrap")
     @classmethod
@@ -206,7 +210,7 @@ class Table(BaseModel):
                 yield Problem(name, None, f"must be given with {', '.join(said)}{_about(type(self), name)}")
         for name in given:
             if name not in own:
-                takes = f"does not belong to {', '.join(said)}, which takes {', '.join(own)}"
+                takes = f"does not belong to {', '.join(said)}, which takes {', '.join(own) or 'nothing more'}"
                 yield Problem(name, fields[name], takes)
 
     def tree(self) -> dict[str, Any]:
@@ -214,8 +218,9 @@ class Table(BaseModel):
         return self.model_dump(mode="json", exclude_none=True)
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """What of the table's tree changes the result."""
-        return tree
+        """What of the table's tree changes the result; the tree itself where all of it does."""
+        old = {key for key, default in self.added.items() if key in tree and tree[key] == default}
+        return {key: value for key, value in tree.items() if key not in old} if old else tree
 
 
 @cache
@@ -241,6 +246,9 @@ def _about(table: type[BaseModel], field: str) -> str:
 
 
 # --- tables
+
+
+LATTICES = ("lattice", "triangular")  # sources of nodes that are built in
 
 
 class Domain(Table):
@@ -269,20 +277,38 @@ class Nodes(Table):
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
         """A mesh file counts by its content, wherever it is."""
+        tree = super().essence(tree)
         if self.path is None:
             return tree
         return tree | {"path": hashlib.sha256(Path(self.path).read_bytes()).hexdigest()}
 
 
-class ShapeFunctions(Table):
-    """How fields are interpolated between the nodes; `linear` makes no use of gamma and tolerance."""
+class Points(Table):
+    """The material points, which integrate; `linear` shape functions stand on the mesh, and make no use of this."""
 
-    alone: ClassVar = ("kind", "gamma", "tolerance")
+    switches: ClassVar = ("source",)
+    owned: ClassVar = {("lattice",): {"pitch": None}, ("cells",): {}}
+    added: ClassVar = {"source": "lattice"}
+
+    source: Literal["lattice", "cells"] = "lattice"
+    """lattice: a regular lattice of their own over the domain (gmsh, file; those of built-in nodes are one already);
+    cells: the barycentres of the mesh, as in the paper"""
+    pitch: Positive | None = None
+    """nm: edge of the cube that each point has to itself (lattice; default: 0.72 mean distances of the nodes)"""
+
+
+class ShapeFunctions(Table):
+    """How fields are interpolated between the nodes; `linear` makes no use of gamma, width and tolerance."""
+
+    alone: ClassVar = ("kind", "gamma", "width", "tolerance")
 
     kind: Literal["lme", "linear"] = "lme"
     """N_a, eq. (17): local maximum entropy, or linear finite elements on the same mesh"""
     gamma: Annotated[float, FINITE, Field(ge=0.5, le=6)] = 1.8
     """gamma [1]: N_a = exp(-gamma |x - x_a|^2 / h^2 + lambda . (x - x_a)) / Z (lme)"""
+    width: Positive | None = None
+    """h, nm, the same for all functions (lme; default: the spacing of a lattice, else by the largest gap between
+    nodes)"""
     tolerance: Annotated[float, FINITE, Field(gt=0, lt=0.1)] = 1e-6
     """delta_0 [1]: N_a is dropped where exp(-gamma r^2 / h^2) < delta_0 (lme)"""
 
@@ -499,7 +525,7 @@ class Output(Table):
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
         """How often a checkpoint is written changes nothing."""
-        return {key: value for key, value in tree.items() if key != "checkpoint_every"}
+        return {key: value for key, value in super().essence(tree).items() if key != "checkpoint_every"}
 
     def snapshot_count(self, end: float) -> float:
         """How many snapshots a run to `end` writes, reckoned without making them."""
@@ -524,6 +550,8 @@ class Case(Table):
     """the box that is simulated"""
     nodes: Nodes
     """where rho and eta are stored"""
+    points: Points = Points()
+    """where the equations are integrated"""
     shape_functions: ShapeFunctions = ShapeFunctions()
     """how they are interpolated"""
     particles: Particles
@@ -649,8 +677,8 @@ def canonical(tree: Mapping[str, Any]) -> str:
 
 
 def fingerprint(tables: Mapping[str, str]) -> str:
-    """SHA-256 of a case, from the canonical text of each table."""
-    body = ", ".join([f'"{name}": {tables[name]}' for name in sorted(tables)])
+    """SHA-256 of a case, from the canonical text of each table; a table that says nothing is left out."""
+    body = ", ".join([f'"{name}": {tables[name]}' for name in sorted(tables) if tables[name] != "{}"])
     return hashlib.sha256(f"{{{body}}}".encode()).hexdigest()
 
 
@@ -685,6 +713,7 @@ def disagreements(case: Case, agreed: bool = False) -> Iterator[Problem]:
         yield from _particles_inside(case)
         yield from _particles_apart(case)
     yield from _particles_resolved(case)
+    yield from _points_of_their_own(case)
     if not agreed:
         yield from _boxes_inside(case)
     yield from _times_in_order(case)
@@ -752,6 +781,19 @@ def _particles_resolved(case: Case) -> Iterator[Problem]:
         smallest, what = given.smallest(), "the smallest radius or half edge"
     if spacing is not None and spacing > smallest:
         yield Problem("nodes.spacing", spacing, f"must be at most {what}, {smallest}")
+
+
+def _points_of_their_own(case: Case) -> Iterator[Problem]:
+    """A pitch has an effect, and gives no more points than can be numbered."""
+    pitch = case.points.pitch
+    if pitch is None:
+        return
+    if case.nodes.source in LATTICES or case.shape_functions.kind == "linear":
+        allowed = "must be left out: built-in nodes and linear functions come with points (gmsh or file, lme)"
+        yield Problem("points.pitch", pitch, allowed)
+    least = (math.prod(case.domain.size) / MOST_POINTS) ** (1.0 / case.dim)
+    if pitch < least:
+        yield Problem("points.pitch", pitch, f"must be at least {least:.3g}: at most {MOST_POINTS} points")
 
 
 def _boxes_inside(case: Case) -> Iterator[Problem]:

@@ -6,6 +6,9 @@ Arrays have three components in the plane too. Gravity and the press act along t
     normal force     f = d - c v_n - a                 overlap d >= 0; c = 2 zeta sqrt(m_ij); cohesion a
                      f = -a (1 - gap / reach)          apart by less than `reach`
     tangential       |t| <= mu f, t = -(2/7) s - c v_t  with s the slip since the contact was made
+
+A heap is chaotic: the last bit decides where a particle ends. So everything here is `exact`, and what the system's
+library gives elsewhere (powers, logarithms) is rounded first, see `radii.steady`.
 """
 
 import math
@@ -14,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import Floats, Integers
-from .jit import inlined, jit
+from .jit import exact, exact_inlined
 
 TANGENTIAL = 2.0 / 7.0  # stiffness over that of the normal: equal frequencies of both for a solid sphere
 SKIN = 0.3  # pairs nearer than this are listed; the list lasts while nobody has moved by a quarter of it, see `moved`
@@ -59,7 +62,7 @@ def no_contacts() -> Contacts:
     return Contacts(np.zeros(1, np.int64), np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.zeros(1))
 
 
-@jit
+@exact
 def deposit(x: Floats, r: Floats, place: Floats, low: Floats, high: Floats, dim: int, level: float) -> None:
     """Ballistic deposition: each particle falls straight down and stays where it first touches.
 
@@ -101,7 +104,7 @@ def deposit(x: Floats, r: Floats, place: Floats, low: Floats, high: Floats, dim:
         head[cx, cy] = i
 
 
-@jit
+@exact
 def search(x: Floats, r: Floats, old: Contacts) -> Contacts:
     """List the pairs nearer than SKIN by a grid of cells, at a cost linear in n; pairs in touch keep their slip."""
     n, size = len(r), 2.0 * r.max() + SKIN
@@ -153,7 +156,7 @@ def search(x: Floats, r: Floats, old: Contacts) -> Contacts:
     return Contacts(start, partner[:found].copy(), slip, x.copy(), np.zeros(1))
 
 
-@jit
+@exact
 def moved(x: Floats, r: Floats, contacts: Contacts) -> bool:
     """Whether a pair that is not listed may have come within reach: by motions, and by what squeezing has added."""
     if len(contacts.x) != len(x):
@@ -170,7 +173,7 @@ def moved(x: Floats, r: Floats, contacts: Contacts) -> bool:
     return False
 
 
-@jit
+@exact
 def squeeze(x: Floats, low: Floats, high: Floats, up: int, part: float, contacts: Contacts) -> None:
     """The box and all in it lose this part of their height. The places of the last search follow, so that only what
     moves against its surroundings asks for the next one."""
@@ -181,7 +184,7 @@ def squeeze(x: Floats, low: Floats, high: Floats, up: int, part: float, contacts
     contacts.squeezed[0] += part
 
 
-@jit
+@exact
 def march(
     x: Floats, v: Floats, spin: Floats, r: Floats, low: Floats, high: Floats, physics: Physics,
     contacts: Contacts, steps: int,
@@ -223,7 +226,7 @@ def march(
     return contacts, Strain(overlap, pushed / max(pairs, 1), speed, work)
 
 
-@jit
+@exact
 def pair_forces(
     force: Floats, torque: Floats, x: Floats, v: Floats, spin: Floats, r: Floats, mass: Floats,
     contacts: Contacts, physics: Physics,
@@ -268,7 +271,7 @@ def pair_forces(
     return largest, pushed, pairs
 
 
-@inlined
+@exact_inlined
 def rub(
     force: Floats, torque: Floats, i: int, j: int, v: Floats, spin: Floats, r: Floats,
     normal: tuple[float, float, float], closing: float, damping: float, overlap: float, slip: Floats, physics: Physics,
@@ -313,7 +316,7 @@ def rub(
     torque[j, 2] -= r[j] * m2
 
 
-@jit
+@exact
 def wall_forces(
     force: Floats, x: Floats, v: Floats, r: Floats, mass: Floats, low: Floats, high: Floats, physics: Physics
 ) -> float:
@@ -336,7 +339,7 @@ def wall_forces(
     return largest
 
 
-@jit
+@exact
 def exchange(
     x: Floats, r: Floats, low: Floats, high: Floats, dim: int, seed: int, trials: int, heat: float
 ) -> None:
@@ -371,7 +374,7 @@ def exchange(
             r[i], r[j] = r[j], r[i]
 
 
-@jit
+@exact
 def overlap_energy(
     x: Floats, r: Floats, i: int, low: Floats, high: Floats, dim: int, head: Integers, below: Integers, cell: Integers
 ) -> float:

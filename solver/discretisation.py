@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from . import kernels
-from .arrays import Flags, Floats, Numbers
+from . import kernels, sampling
+from .arrays import Array, Flags, Floats, Integers
 from .blocks import Blocks, find_blocks, find_upright
 from .case import Case
 from .energy import Coefficients
@@ -34,8 +35,8 @@ class Discretisation:
     nearest: Nearest
     steepest: float  # the largest of sum_a |N_a| = 1 and sum_a |grad N_a| at any point of any rank, 1/nm
     positions: Floats  # (n, dim) of this rank's nodes, nm
-    at_wall: Flags  # (n,) those within one spacing of a wall
     x: Floats  # (p, dim)
+    at_wall: Flags  # (p,) points within one spacing of a wall
     weights: Floats  # (p,) nm^dim
     mass: Floats  # (n,) m_a = sum_p w_p N_a(x_p) over all ranks   (22)
     first_moment: Floats  # (n, dim) q_a = sum_p w_p x_p N_a(x_p) over all ranks
@@ -51,27 +52,37 @@ class Discretisation:
         """The number of nodes that this rank holds."""
         return len(self.positions)
 
+    def sample(self, u: Floats, points: slice | None = None) -> Floats:
+        """The fields (p, F) of the coefficients u (n, F) at this rank's points, or some of them   (17)"""
+        table = self.shape if points is None else self.shape.part(points)
+        values = np.empty((table.points, u.shape[1]))
+        sampling.sample(values, u, table.offsets, table.nodes, table.rows, table.table)
+        return values
+
     @property
     def huang(self) -> bool:
         """Whether v_adv = sum eta_a v_a (11); else Wang's v_adv = sum v_a."""
         return self.case.model.advection == "huang"
 
 
-def shape_table(
-    case: Case, points: Floats, spacing: Floats, cells: Numbers, nodes: Floats, grid: Grid | None = None
-) -> ShapeTable:
-    """The shape functions that the case asks for, at points in the given cells; grid: of the nodes, if it exists."""
+def shape_table(case: Case, mesh: Mesh, points: Integers) -> ShapeTable:
+    """The shape functions that the case asks for, at some of the mesh's points."""
+    if case.shape_functions.kind == "linear":
+        return linear(mesh.points[points], mesh.cells[points], mesh.nodes)
+    return lme_at(case, mesh, mesh.points[points])
+
+
+def lme_at(case: Case, mesh: Mesh, x: Floats, grid: Grid | None = None) -> ShapeTable:
+    """The case's maximum-entropy functions anywhere; grid: of the nodes, if it exists."""
     given = case.shape_functions
-    if given.kind == "linear":
-        return linear(points, cells, nodes)
-    return lme(points, spacing, nodes, given.gamma, given.tolerance, grid)
+    return lme(x, np.full(len(x), mesh.width), mesh.nodes, given.gamma, given.tolerance, grid)
 
 
 def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discretisation:
     """This rank's share of the mesh; `activity` (p,) > 0 is the expected work of each point. Collective."""
     part = bisect(mesh.points, activity, ranks.size)
     points = np.flatnonzero(part == ranks.rank)
-    table = shape_table(case, mesh.points[points], mesh.spacing[points], mesh.cells[points], mesh.nodes)
+    table = shape_table(case, mesh, points)
     seen = np.zeros(len(mesh.nodes), dtype=np.int8)
     kernels.touch(seen, np.ones(points.size, dtype=bool), table.offsets, table.nodes)
     nodes = np.flatnonzero(seen)
@@ -90,12 +101,12 @@ def discretise(case: Case, mesh: Mesh, ranks: Ranks, activity: Floats) -> Discre
     share.halo.add(first_moment)
     _check_mass(mesh, share, mass)
     positions = mesh.nodes[nodes]
-    at_wall = np.asarray((np.minimum(positions, size - positions) <= mesh.spacing.max()).any(axis=1))
+    at_wall = np.asarray((0.5 * size - np.abs(x) <= mesh.spacing.max()).any(axis=1))
     blocks = find_blocks(table, x, shared)
     upright = find_upright(table, x, positions, blocks)
     return Discretisation(
         case, share, table, blocks, upright, nearest(table, NEAR), steepest(table, ranks),
-        positions, at_wall, x, weights, mass, first_moment,
+        positions, x, at_wall, weights, mass, first_moment,
         Coefficients(*(getattr(case.model, name) for name in Coefficients._fields)),
     )
 
@@ -127,5 +138,16 @@ def activity(mesh: Mesh, u: Floats, eps: float) -> Floats:
     points live.
     """
     varies, fields = np.zeros(len(mesh.cells), dtype=bool), np.zeros(len(mesh.cells), dtype=np.int32)
-    kernels.variation(varies, fields, mesh.cells, u, eps * mesh.spacing, eps)
+    spacing = mesh.spacing if mesh.in_cells else np.full(len(mesh.cells), mesh.width)
+    kernels.variation(varies, fields, mesh.cells, u, eps * spacing, eps)
+    if not mesh.in_cells:
+        varies, fields = (_at_points(mesh, values) for values in (varies, fields))
     return np.where(varies | (varies.mean() > WORTH), FIXED_WORK + fields, RESTING_WORK)
+
+
+def _at_points(mesh: Mesh, values: Array) -> Array:
+    """The largest of the values of the cells around the node that is nearest to each point."""
+    at_nodes = np.zeros(len(mesh.nodes), dtype=values.dtype)
+    for column in mesh.cells.T:
+        np.maximum.at(at_nodes, column, values)
+    return at_nodes[np.asarray(cKDTree(mesh.nodes).query(mesh.points)[1])]

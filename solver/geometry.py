@@ -1,7 +1,7 @@
 """Meshes: nodes, simplex cells and one material point per cell, numbered so that neighbours lie near in memory.
 
-The points integrate (Huang et al. 2023, equations 17-29): x_p is the barycentre of cell p, w_p its volume.
-Lattices, gmsh and mesh files all end in `_build`, so every mesh has passed the same checks.
+The points integrate (Huang et al. 2023, equations 17-29): x_p is the barycentre of cell p, w_p its volume; `points`
+puts a lattice of points in their place. Lattices, gmsh and mesh files all end in `_build`.
 """
 
 import io
@@ -41,19 +41,25 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """n nodes and p simplex cells in dim = 2 or 3 dimensions; lengths in nm."""
+    """n nodes, simplex cells and p material points in dim = 2 or 3 dimensions; lengths in nm."""
 
     nodes: Floats  # (n, dim)
-    cells: Numbers  # (p, dim + 1) node numbers, positively oriented
-    points: Floats  # (p, dim) barycentres x_p
-    weights: Floats  # (p,) cell volumes w_p, nm^dim
-    spacing: Floats  # (p,) local nodal spacing h
+    cells: Numbers  # (c, dim + 1) node numbers, positively oriented
+    points: Floats  # (p, dim) x_p: barycentres of the cells, or a lattice of their own
+    weights: Floats  # (p,) w_p: volumes of the cells, or equal parts of the domain, nm^dim
+    spacing: Floats  # (p,) nodal spacing around each point
+    width: float  # h of the shape functions
+    in_cells: bool  # whether point p is the barycentre of cell p
 
 
-def make_mesh(nodes: "Nodes", size: Sequence[float], rows: bool = True) -> Mesh:
-    """The mesh that the case asks for, in the box [0, size]; rows: how to number the nodes of a lattice."""
+def make_mesh(nodes: "Nodes", size: Sequence[float], rows: bool = True, integrates: bool = True) -> Mesh:
+    """The mesh that the case asks for, in the box [0, size]; rows: how to number the nodes of a lattice.
+
+    integrates: whether its cells are integrated over; else nodes of a file that coincide are merged, and cells may be
+    flat.
+    """
     if nodes.source == "file" and nodes.path is not None:
-        return file_mesh(nodes.path, size)
+        return file_mesh(nodes.path, size, integrates)
     if nodes.source != "file" and nodes.spacing is not None:
         if nodes.source == "gmsh":
             return gmsh_mesh(size, nodes.spacing)
@@ -192,11 +198,12 @@ def _generate(gmsh: Any, box: tuple[float, ...], spacing: float) -> tuple[Floats
     return coordinates.reshape(-1, 3)[:, :dim].copy(), number[connectivity].reshape(-1, dim + 1)
 
 
-def file_mesh(path: str | Path, size: Sequence[float]) -> Mesh:
+def file_mesh(path: str | Path, size: Sequence[float], integrates: bool = True) -> Mesh:
     """The triangles (2-D) or tetrahedra (3-D) of frit's own mesh file or any that meshio reads; it ignores other cells.
 
     Nodes of no cell are dropped. Refuses nodes outside the box [0, size], and 2-D meshes off a plane of
-    constant z. What was uploaded to a service (FRIT_UPLOADS) is read only as frit's own file.
+    constant z. What was uploaded to a service (FRIT_UPLOADS) is read only as frit's own file. integrates: see
+    `make_mesh`.
     """
     box = np.array(_checked_box(size, 1.0))
     dim, kind = len(box), CELL_KIND[len(box)]
@@ -209,7 +216,19 @@ def file_mesh(path: str | Path, size: Sequence[float]) -> Mesh:
         raise MeshError(f"{path}: {dim} coordinates are needed, the file has an array of nodes of shape {nodes.shape}")
     _refuse_lost(path, kind, nodes, cells)
     _refuse_outside(path, nodes, np.unique(cells), box)
-    return _build(np.ascontiguousarray(nodes[:, :dim]), cells.astype(np.int32), None)
+    nodes = np.ascontiguousarray(nodes[:, :dim])
+    if not integrates:
+        nodes, cells = _merged(nodes, cells)
+    return _build(nodes, cells.astype(np.int32), None, integrates=integrates)
+
+
+def _merged(nodes: Floats, cells: Integers) -> tuple[Floats, Integers]:
+    """Nodes in the same place become one; cells that have it twice are gone."""
+    _, first, number = np.unique(nodes + 0.0, axis=0, return_index=True, return_inverse=True)
+    if len(first) == len(nodes):
+        return nodes, cells
+    cells = number.reshape(-1)[cells]
+    return nodes[first], cells[(np.diff(np.sort(cells, axis=1), axis=1) > 0).all(axis=1)]
 
 
 def _refuse_lost(path: str | Path, kind: str, nodes: Floats, cells: Integers) -> None:
@@ -278,10 +297,12 @@ def _refuse_outside(path: str | Path, nodes: Floats, used: Integers, box: Floats
         raise MeshError(f"{path}: not planar: z from {x[:, dim].min()} to {x[:, dim].max()} in a 2-D domain")
 
 
-def _build(nodes: Floats, cells: Numbers, spacing: float | None, rows: bool = False) -> Mesh:
+def _build(
+    nodes: Floats, cells: Numbers, spacing: float | None, rows: bool = False, integrates: bool = True
+) -> Mesh:
     """Check, orient (in place) and order, nodes by rows or curve; spacing None: measure it.
 
-    Errors number nodes and cells as given.
+    Errors number nodes and cells as given. integrates: see `make_mesh`.
     """
     used = np.zeros(len(nodes), dtype=np.bool_)
     for column in cells.T:
@@ -290,12 +311,13 @@ def _build(nodes: Floats, cells: Numbers, spacing: float | None, rows: bool = Fa
     lower, upper = nodes[numbers].min(axis=0), nodes[numbers].max(axis=0)
     extent = float((upper - lower).max())
     volumes, points = _measure(nodes, cells)
-    _refuse_flat(nodes, cells, volumes, extent)
+    if integrates:
+        _refuse_flat(nodes, cells, volumes, extent)
     flip = np.flatnonzero(volumes < 0)
     cells[flip, -2], cells[flip, -1] = cells[flip, -1], cells[flip, -2]
 
-    numbers = numbers[np.lexsort(nodes[numbers].T) if rows else _along_curve(nodes[numbers], lower, extent)]
-    order = _along_curve(points, lower, extent)
+    numbers = numbers[np.lexsort(nodes[numbers].T) if rows else along_curve(nodes[numbers], lower, extent)]
+    order = along_curve(points, lower, extent)
     rank = np.empty(len(nodes), dtype=np.int32)
     rank[numbers] = np.arange(len(numbers), dtype=np.int32)
     nodes, cells = nodes[numbers], cells[order]
@@ -304,7 +326,7 @@ def _build(nodes: Floats, cells: Numbers, spacing: float | None, rows: bool = Fa
     points = points[order]  # one by one: at most one of the large arrays exists twice
     weights = np.abs(volumes[order])
     local = _local_spacing(nodes, cells, numbers) if spacing is None else np.full(len(cells), float(spacing))
-    return Mesh(nodes, cells, points, weights, local)
+    return Mesh(nodes, cells, points, weights, local, float(local.max()), in_cells=True)
 
 
 def _measure(nodes: Floats, cells: Numbers) -> tuple[Floats, Floats]:
@@ -338,7 +360,7 @@ def _refuse_flat(nodes: Floats, cells: Numbers, volumes: Floats, extent: float) 
             raise MeshError(f"{CELL_KIND[dim]} {cell} has no volume: nodes {cells[cell]} at {x.tolist()}")
 
 
-def _along_curve(x: Floats, lower: Floats, extent: float) -> Integers:
+def along_curve(x: Floats, lower: Floats, extent: float) -> Integers:
     """The order of x along Morton's curve in the cube at `lower`: near in space comes to lie near in memory.
 
     The code interleaves integer coordinates of 31 bits each in 2-D, 21 in 3-D. Ties keep their order.

@@ -3,6 +3,7 @@
 Lengths are in units of the mean radius and measured from the container's lower corner; see dem.py for the forces.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 from . import dem
 from .arrays import Floats, Integers
 from .pack_measures import near_pairs, touching, volumes
+from .radii import steady
 
 LOOSEST = {2: 0.34, 3: 0.17}  # solid fraction of the pile between its walls, by dimension
 SETTLED = {2: 0.75, 3: 0.55}  # solid fraction from which gravity takes over
@@ -26,6 +28,7 @@ LONGEST = 500  # times 100 steps, for each
 CALM = 0.02  # drag of the later stages
 DRAG = 0.1  # of the medium in which a heap relaxes
 THICK = 0.4  # of that in which it is pressed: what gives way does not shake the others, or equal discs would order
+BATCH = 25  # steps of the press between two looks
 STRAIN = 1e-3  # of the press, per step: neighbours approach by 0.002 radii
 YIELDING = 0.01  # overlap at which the press waits for the heap to give way
 PATIENCE = 60  # times 50 steps, for which it waits
@@ -88,7 +91,7 @@ class Heap:
         self._lower(solid / SETTLED[self.dim], drag=DRAG, lid=False)
         first = gravity = 0.02 / max(0.5 * solid, 1.0)
         for stage in range(MOST):
-            drag, slow = gravity / FALL + (CALM if stage else 0.0), REST * (gravity / first) ** 0.5
+            drag, slow = gravity / FALL + (CALM if stage else 0.0), REST * math.sqrt(gravity / first)
             strain = self._until_slow(slow, gravity=gravity, friction=friction, drag=drag, lid=False)
             if stage >= STAGES and strain.overlap < RESTING:
                 self._until_slow(LAST * slow, gravity=gravity, friction=friction, drag=drag, lid=False)
@@ -111,16 +114,27 @@ class Heap:
         """Lower the top of the box from that of the pile to the height, and all below with it; False: it jams."""
         up, waited = self.up, 0
         self.high[up] = self.top
-        strain = self.march(25, **physics)
+        strain = self.march(BATCH, **physics)
         while self.high[up] > height * (1.0 + 1e-12):
             if strain.overlap > YIELDING:
                 if waited == PATIENCE:
                     return False
                 waited, strain = waited + 1, self.march(50, **physics)
                 continue
-            waited, squeeze = 0, 1.0 - (height / self.high[up]) ** (1.0 / 25.0)
-            strain = self.march(25, squeeze=min(squeeze, STRAIN), **physics)
+            waited, strain = 0, self.march(BATCH, squeeze=self._squeeze(height), **physics)
         return True
+
+    def _squeeze(self, height: float) -> float:
+        """The part that the box loses per step, so that BATCH of them bring it to the height, or nearer to it.
+
+        The root is Newton's, which takes no power of the system's library (see `radii.steady`).
+        """
+        ratio = height / float(self.high[self.up])
+        kept = 1.0 - (1.0 - ratio) / BATCH
+        for _ in range(4):
+            power = math.prod([kept] * (BATCH - 1))
+            kept -= (kept * power - ratio) / (BATCH * power)
+        return min(1.0 - kept, STRAIN)
 
     def relax(self) -> bool:
         """Wait until overlaps are small; False where they do not become so."""
@@ -134,11 +148,10 @@ class Heap:
         up, n = self.up, len(self.r)
         self.high[up] = self.top
         while self.high[up] > height * (1.0 + 1e-12):
-            squeeze = 1.0 - (height / self.high[up]) ** (1.0 / 25.0)
-            self.march(25, drag=DRAG, squeeze=min(squeeze, STRAIN))
+            self.march(BATCH, drag=DRAG, squeeze=self._squeeze(height))
         for k in range(rounds):
             velocity = HEAT * (1.0 - k / rounds)
-            self.v[:, : self.dim] = self.rng.normal(scale=velocity, size=(n, self.dim))
+            self.v[:, : self.dim] = velocity * steady(self.rng.normal(size=(n, self.dim)))
             seed = int(self.rng.integers(2**31))
             dem.exchange(self.x, self.r, self.low, self.high, self.dim, seed, 20 * n, velocity**2)
             self.contacts = dem.no_contacts()
@@ -183,7 +196,7 @@ class Heap:
     def _move(self, members: Integers, a: int, b: int) -> bool:
         """Move the members until a of theirs touches b; False, and nothing moved, where there is no room."""
         line = self.x[b] - self.x[a]
-        apart = float(np.linalg.norm(line))
+        apart = math.sqrt(float((line**2).sum()))
         moved = self.x[members] + line * (1.0 - (self.r[a] + self.r[b]) / apart)
         d, slack = self.dim, 1e-6
         r = self.r[members, None]

@@ -92,7 +92,8 @@ def seed(folder: Path) -> None:
 numba.config.CACHE_DIR = str(trusted_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-OPTIONS: dict[str, Any] = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
+EXACT: dict[str, Any] = {"cache": True, "error_model": "numpy"}
+OPTIONS: dict[str, Any] = EXACT | {"fastmath": FASTMATH}
 
 
 def jit(function: Function) -> Function:
@@ -116,3 +117,13 @@ def lean(function: Function) -> Function:
 def lean_jit(function: Function) -> Function:
     """`jit` for functions that make no arrays, see `lean`."""
     return cast(Function, numba.njit(_nrt=False, **OPTIONS)(function))
+
+
+def exact(function: Function) -> Function:
+    """`jit` where every operation is done as written: every processor gives the same numbers, to the last bit."""
+    return cast(Function, numba.njit(**EXACT)(function))
+
+
+def exact_inlined(function: Function) -> Function:
+    """`inlined`, likewise."""
+    return cast(Function, numba.njit(forceinline=True, **EXACT)(function))

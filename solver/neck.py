@@ -3,11 +3,14 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .arrays import Floats, Numbers
+from . import field
+from .arrays import Floats
 from .case import Case
-from .discretisation import shape_table
-from .geometry import Mesh
+from .geometry import Mesh, lattice
 from .neighbours import make_grid
+from .points import on_mesh
+
+NET = {2: 0.5, 3: 0.75}  # widths: spacing of the lattice on which a neck is measured where the nodes are none
 
 # Where eta_1 = eta_2 crosses a cell's edges, by the number of its corners (in falling order) with eta_1 > eta_2.
 SECTIONS = {
@@ -24,37 +27,27 @@ class Neck:
 
     def __init__(self, case: Case, mesh: Mesh) -> None:
         self.case, self.mesh = case, mesh
-        self.grid = make_grid(mesh.nodes, 2.0 * float(np.median(mesh.spacing)))
-        self.points = cKDTree(mesh.points)
-        size = np.asarray(case.domain.size)
-        self.wall = np.asarray(((mesh.nodes <= 0.0) | (mesh.nodes >= size)).any(axis=1))
+        self.grid = make_grid(mesh.nodes, 2.0 * mesh.width)
+        self.net, self.nearest = mesh, np.arange(len(mesh.nodes))
+        if not on_mesh(case):
+            self.net = lattice(case.domain.size, NET[case.dim] * mesh.width)
+            self.nearest = np.asarray(cKDTree(mesh.nodes).query(self.net.nodes)[1])
 
     def measure(self, fields: Floats) -> float:
-        """Length in nm (2-D) or area in nm^2 (3-D); fields (n, 3) are the nodal rho, eta_1, eta_2.
+        """Length in nm (2-D) or area in nm^2 (3-D); fields (n, 3) are the coefficients of rho, eta_1, eta_2.
 
-        The interpolated fields u(x) = sum_a N_a(x) u_a are evaluated at the corners of the cells in the contact and are
-        linear in between.
+        The fields u(x) = sum_a N_a(x) u_a are evaluated at the corners of the cells in the contact and are linear in
+        between. The cells are the mesh's where it is a lattice or its functions are linear, else those of a lattice.
         """
-        corner = fields[self.mesh.cells]
+        corner = fields[self.nearest[self.net.cells]]
         high = corner.max(axis=1)
-        cells = self.mesh.cells[(high[:, 0] > 0.2) & (high[:, 1] > 0.01) & (high[:, 2] > 0.01)]
+        cells = self.net.cells[(high[:, 0] > 0.2) & (high[:, 1] > 0.01) & (high[:, 2] > 0.01)]
         numbers, places = np.unique(cells, return_inverse=True)
-        u = self._at_nodes(fields, numbers)
-        return section(self.mesh.nodes[cells], u[places.reshape(cells.shape)])
-
-    def _at_nodes(self, fields: Floats, numbers: Numbers) -> Floats:
-        """The interpolated fields at some nodes; on the walls and for linear functions the nodal values themselves."""
-        values = fields[numbers]
-        if self.case.shape_functions.kind == "linear" or not numbers.size:
-            return values
-        inner = ~self.wall[numbers]
-        points = self.mesh.nodes[numbers[inner]]
-        _, nearest = self.points.query(points)
-        spacing, no_cells = self.mesh.spacing[nearest], self.mesh.cells[:0]
-        table = shape_table(self.case, points, spacing, no_cells, self.mesh.nodes, self.grid)
-        entries = fields[table.nodes] * table.entries()[0][:, None]
-        values[inner] = np.add.reduceat(entries, table.offsets[:-1], axis=0)
-        return values
+        if on_mesh(self.case):
+            u = field.at_nodes(self.case, self.mesh, numbers, fields, self.grid)
+        else:
+            u = field.at(self.case, self.mesh, self.net.nodes[numbers], fields, self.grid)
+        return section(self.net.nodes[cells], u[places.reshape(cells.shape)])
 
 
 def section(corners: Floats, u: Floats) -> float:

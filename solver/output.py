@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,10 @@ from .arrays import Floats, Numbers
 from .case import Case
 from .checkpoint import replace_durably
 from .partition import Collector, Ranks
-from .state import State
 
 BLOCK = 65_536  # nodes per chunk of a snapshot
+# Of the group; those of before had no `values`, and held coefficients.
+ATTRIBUTES: dict[str, Any] = {"length_unit": "nm", "values": "fields at the nodes"}
 
 
 class DirectoryError(ValueError):
@@ -93,6 +94,14 @@ class History:
         self.file.close()
 
 
+class Fields(NamedTuple):
+    """What a snapshot holds of some nodes."""
+
+    rho: Floats
+    eta_squared: Floats  # sum eta^2
+    particle: Numbers  # with the largest eta where rho >= 1/2, else -1
+
+
 class Snapshots:
     """snapshots.zarr, zarr v3: every rank writes the chunks of its block of nodes.
 
@@ -101,9 +110,12 @@ class Snapshots:
     arrays before or after, never between; `time` grows last for all others.
     """
 
-    def __init__(self, directory: Path, case: Case, positions: Callable[[], Floats], collector: Collector, fresh: bool) -> None:
+    def __init__(
+        self, directory: Path, case: Case, positions: Callable[[], Floats], collector: Collector, fresh: bool
+    ) -> None:
         """Collective. positions: of all nodes (n, dim); fresh: make the group anew, else go on with the one there."""
         self.path, self.collector, self.ranks = directory / "snapshots.zarr", collector, collector.share.ranks
+        self.times = case.output.snapshot_times(case.time.end)
         if self.ranks.root and fresh:
             create_group(self.path, case, positions(), collector.block)
         elif self.ranks.root:
@@ -111,44 +123,50 @@ class Snapshots:
                 torn.unlink()
         self.ranks.barrier()
 
-    def write(self, number: int, time: float, rho: Floats, particle: Numbers, eta_squared: Floats) -> None:
-        """Write snapshot `number` (again, where a resumed run passes it again) of this rank's nodes. Collective."""
-        values = {"rho": rho, "eta_squared": eta_squared, "particle": particle}
+    def write(self, number: int, time: float, fields: Fields | None) -> None:
+        """Write snapshot `number` (again, where a resumed run passes it again). Collective.
+
+        fields: at the nodes of this rank's blocks, see `partition.Collector`; None where it has none.
+        """
         first, last = self.collector.first, self.collector.last
-        for name, local in values.items():
-            block = self.collector.blocks(np.ascontiguousarray(local))
-            if last > first:
+        if fields is not None and last > first:
+            for name, block in fields._asdict().items():
                 grown(self.path, name, number + 1)[number, first:last] = block
         self.ranks.barrier()
         if self.ranks.root:
             self._publish(number, time)
         self.ranks.barrier()
 
+    def next(self, time: float) -> int:
+        """The number of the first snapshot that was asked for after a time."""
+        return sum(asked <= time for asked in self.times)
+
     def _publish(self, number: int, time: float) -> None:
         import zarr
 
         names = ("rho", "eta_squared", "particle", "time")
         stored = {name: zarr.open_array(self.path, path=name, mode="r+") for name in names}
+        grown(self.path, "time", number + 1)[number] = time
         if stored["time"].shape[0] <= number:
-            grown(self.path, "time", number + 1)[number] = time
             for array in stored.values():
                 array.resize((number + 1, *array.shape[1:]))
         consolidate(self.path)  # again too, where a run was killed just before this line
 
 
-def owners(u: Floats, state: State) -> tuple[Numbers, Floats]:
-    """For each node: the particle with the largest eta where rho >= 1/2, else -1; and sum eta^2."""
-    eta = u[:, 1 : 1 + state.owner.shape[1]]
+def fields_of(values: Floats, owner: Numbers) -> Fields:
+    """Of fields by slots: values (n, 1 + slots) hold rho and the slots of eta, owner (n, slots) whose they are."""
+    eta = values[:, 1 : 1 + owner.shape[1]]
     slot = eta.argmax(axis=1)
-    particle = np.take_along_axis(state.owner, slot[:, None], axis=1)[:, 0]
-    return np.where(u[:, 0] >= 0.5, particle, -1).astype(np.int32), (eta**2).sum(axis=1)
+    particle = np.take_along_axis(owner, slot[:, None], axis=1)[:, 0]
+    solid = np.where(values[:, 0] >= 0.5, particle, -1).astype(np.int32)
+    return Fields(values[:, 0], (eta**2).sum(axis=1), solid)
 
 
 def create_group(path: Path, case: Case, positions: Floats, block: int) -> None:
     """An empty group with the positions of the nodes."""
     import zarr
 
-    group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"name": case.name, "length_unit": "nm"})
+    group = zarr.open_group(path, mode="w", zarr_format=3, attributes=ATTRIBUTES | {"name": case.name})
     count, dim = positions.shape
     nodes = group.create_array(
         "nodes", shape=(count, dim), chunks=(block, dim), dtype="float64", dimension_names=("node", "axis"),

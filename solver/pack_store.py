@@ -21,7 +21,7 @@ from .pack_measures import solid_fraction
 from .packing import Packing, Request, make, request
 
 NAME = "particles.csv"  # in a run directory
-CODE = ("dem.py", "heap.py", "packing.py", "pack_measures.py", "radii.py")
+CODE = ("dem.py", "heap.py", "jit.py", "overlaps.py", "packing.py", "pack_measures.py", "radii.py")
 
 
 def packed(case: Case, pause: Callable[[], None] = lambda: None) -> Packing:

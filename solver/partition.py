@@ -261,15 +261,19 @@ class Collector:
         placed[self.place] = self._route(values[self.share.owned])
         return placed
 
-    def whole(self, values: Array) -> Array | None:
-        """All values in the mesh's order on rank 0, None elsewhere."""
+    def whole(self, values: Array, everywhere: bool = False) -> Array | None:
+        """All values in the mesh's order on rank 0, None elsewhere; or on every rank."""
         part = self.blocks(values)
         ranks = self.share.ranks
         if ranks.size == 1:
             return part
         row = int(np.prod(values.shape[1:], dtype=np.int64))
         kind = MPI._typedict[values.dtype.char]
-        everything = np.empty((self.share.total, *values.shape[1:]), dtype=values.dtype) if ranks.root else None
-        target = [everything, self.lengths * row, kind] if ranks.root else None
-        ranks.comm.Gatherv([part, part.size, kind], target)
+        wanted = ranks.root or everywhere
+        everything = np.empty((self.share.total, *values.shape[1:]), dtype=values.dtype) if wanted else None
+        target = [everything, self.lengths * row, kind] if wanted else None
+        if everywhere:
+            ranks.comm.Allgatherv([part, part.size, kind], target)
+        else:
+            ranks.comm.Gatherv([part, part.size, kind], target)
         return everything

@@ -4,14 +4,24 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
 from .arrays import Floats
 
 SMALLEST = 0.2  # of the mean: no radius is drawn below
+BITS = 36  # that are kept of 53
 
 Distribution = Literal["normal", "lognormal", "histogram"]
 Histogram = Sequence[tuple[float, float]]  # radius, weight
+
+
+def steady(values: ArrayLike) -> Floats:
+    """The values with BITS bits: exponentials, logarithms and powers, whose last bit is another on another processor,
+    are the same there, but for one in 2^16 of those that differ.
+    """
+    mantissa, exponent = np.frexp(values)
+    return np.asarray(np.ldexp(np.rint(np.ldexp(mantissa, BITS)), exponent - BITS))
 
 
 def draw(
@@ -42,6 +52,7 @@ def draw(
         raw = mean * np.exp(width * _normal(levels, -truncation, truncation) - 0.5 * width**2)
     else:
         raw = mean + std * _normal(levels, max(-truncation, (SMALLEST - 1.0) * mean / std), truncation)
+    raw = steady(raw)
     return np.asarray(np.maximum(mean + (raw - raw.mean()) * (std / raw.std()), SMALLEST * mean))
 
 

@@ -4,13 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import singledispatch
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from . import unknowns
-from .arrays import Floats
+from . import vectors
+from .arrays import Floats, Integers
 from .case import Case
+from .discretisation import Discretisation
 from .integrators import Integrator
 from .partition import Ranks
 from .scheme import Scheme
@@ -120,7 +121,7 @@ def reached(waiting: list[Event], time: float) -> Iterator[Event]:
 
 
 @singledispatch
-def renew(scheme: Scheme, state: State, y: Floats) -> bool:
+def renew(scheme: Any, state: Any, y: Floats) -> bool:
     """Make the set of live points anew when a value that it rests on has moved, and every `REFRESH` steps.
 
     True where that happened: rates computed before no longer hold. Collective.
@@ -137,26 +138,40 @@ def renew(scheme: Scheme, state: State, y: Floats) -> bool:
 
 
 @singledispatch
-def check(scheme: Scheme, state: State, y: Floats) -> None:
-    """Raise RunError on every rank where a value of y, the state's unknowns, is none or out of range. Collective."""
+def check(scheme: Any, state: Any, y: Floats) -> None:
+    """Raise RunError on every rank where a field of the state is no number, or out of range; y: its unknowns.
+
+    Collective. Fields are means of coefficients: where all of these are in range, nothing else has to be looked at.
+    """
     d = scheme.d
-    bad = unknowns.first_outside(y, scheme.active.unknowns.strips, d.at_wall, LOWEST, HIGHEST, HIGHEST_AT_WALL)
-    worst = d.share.ranks.max(np.array([-1.0 if bad < 0 else float(d.share.nodes[bad])]))
-    if worst[0] < 0.0:
+    if d.share.ranks.max(np.array([not vectors.within(y, LOWEST, HIGHEST)], dtype=float))[0] == 0.0:
         return
-    here = np.flatnonzero(d.share.nodes == int(worst[0]))
-    raise RunError(_said(d.share.ranks, describe(scheme, state, int(here[0])) if here.size else None))
+    fields = d.sample(np.ascontiguousarray(state.u[:, : 1 + state.owner.shape[1]]))
+    most = np.where(d.at_wall[:, None] & (np.arange(fields.shape[1]) == 0), HIGHEST_AT_WALL, HIGHEST)
+    bad = np.flatnonzero(~((fields >= LOWEST) & (fields <= most)).all(axis=1))
+    if (first := _lowest(d, bad)) is not None:
+        here = np.flatnonzero(d.share.points == first)
+        raise RunError(_said(d.share.ranks, describe(scheme, state, int(here[0])) if here.size else None))
+
+
+def _lowest(d: Discretisation, points: Integers) -> int | None:
+    """The lowest number of the given points of all ranks. Collective."""
+    mine = -float(d.share.points[points[0]]) if points.size else -np.inf
+    found = d.share.ranks.max(np.array([mine]))[0]
+    return int(-found) if np.isfinite(found) else None
 
 
 @singledispatch
-def piled_up(scheme: Scheme, state: State) -> str | None:
+def piled_up(scheme: Any, state: Any) -> str | None:
     """Where rho exceeds `HIGHEST` at a wall, or None. Collective.
 
     The flux through a wall is zero, but nothing stops a particle that its neighbours push there: what it carries
     piles up in the outermost nodes, and spreads again when the push ends. That is the model, so the run goes on.
     """
     d = scheme.d
-    rho = np.where(d.at_wall, state.u[:, 0], -np.inf)
+    if not d.share.ranks.max(np.array([state.rho.max(initial=-np.inf)]))[0] > HIGHEST:
+        return None
+    rho = np.where(d.at_wall, d.sample(np.ascontiguousarray(state.u[:, :1]))[:, 0], -np.inf)
     most = d.share.ranks.max(np.array([rho.max(initial=-np.inf)]))
     if not most[0] > HIGHEST:
         return None
@@ -170,27 +185,28 @@ def _said(ranks: Ranks, mine: str | None) -> str:
     return said[0]
 
 
-def fields_at(scheme: Scheme, state: State, node: int) -> str:
-    """Time, step, place and fields of a node of this rank."""
-    place = ", ".join(f"{x:.3f}" for x in scheme.d.positions[node])
-    fields = [f"rho = {state.u[node, 0]:.4g}"]
-    fields += [
-        f"eta of particle {a} = {state.u[node, 1 + s]:.4g}" for s, a in enumerate(state.owner[node]) if a >= 0
-    ]
-    return (
-        f"at t = {state.time:.6g}, step {state.step}, node {scheme.d.share.nodes[node]} at ({place}) nm: "
-        f"{', '.join(fields)}"
-    )
+def fields_at(scheme: Scheme, state: State, point: int) -> str:
+    """Time, step, place and fields of a point of this rank."""
+    d, entries = scheme.d, scheme.d.shape.of(point)
+    place = ", ".join(f"{x:.3f}" for x in d.x[point] + 0.5 * np.asarray(d.case.domain.size))
+    values = entries[1] @ state.u[entries[0]]
+    fields = [f"rho = {values[0]:.4g}"]
+    for slot, owner in enumerate(state.owner[entries[0]].T):
+        if (owner >= 0).any():
+            particle = owner[np.argmax(np.where(owner >= 0, entries[1], -1.0))]
+            fields.append(f"eta of particle {particle} = {values[1 + slot]:.4g}")
+    return f"at t = {state.time:.6g}, step {state.step}, at ({place}) nm: {', '.join(fields)}"
 
 
-def describe(scheme: Scheme, state: State, node: int) -> str:
-    """Time, step, place and likely cause of a bad value at a node of this rank."""
+def describe(scheme: Scheme, state: State, point: int) -> str:
+    """Time, step, place and likely cause of a bad field at a point of this rank."""
     cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
     if scheme.d.case.model.rigid_motion:
         cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
     highest = HIGHEST
-    if scheme.d.at_wall[node] and state.u[node, 0] > HIGHEST_AT_WALL:
+    nodes, shares = scheme.d.shape.of(point)
+    if scheme.d.at_wall[point] and shares @ state.rho[nodes] > HIGHEST_AT_WALL:
         highest = HIGHEST_AT_WALL
         if scheme.d.case.model.rigid_motion:
             cause = f"{PRESSED}, or {cause}"
-    return f"{fields_at(scheme, state, node)} left [{LOWEST:g}, {highest:g}]; likely cause: {cause}"
+    return f"{fields_at(scheme, state, point)} left [{LOWEST:g}, {highest:g}]; likely cause: {cause}"

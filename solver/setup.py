@@ -3,15 +3,19 @@
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from . import checkpoint
-from .arrays import Floats, Numbers
+from .arrays import Floats
 from .case import Case
+from .field import at_nodes
 from .geometry import Mesh
 from .integrators import Integrator
 from .lattice.setup import LatticeSetup
 from .observe import Observables
-from .output import owners
+from .output import Fields, fields_of
 from .partition import Collector, Ranks, Share
+from .points import remarks
 from .prepare import build_mesh, make_integrator, prepare
 from .scheme import Scheme
 from .slots import repack
@@ -44,8 +48,11 @@ class Setup(Protocol):
     def rows(self, system: Any, state: Any) -> Rows:
         """What computes the history."""
 
-    def nodal(self, system: Any, state: Any, u: Floats) -> tuple[Floats, Numbers, Floats]:
-        """rho, owner and sum eta^2 at this rank's nodes."""
+    def fields(self, system: Any, state: Any, u: Floats, collector: Collector) -> Fields | None:
+        """What a snapshot holds of the nodes of this rank's blocks."""
+
+    def remarks(self) -> list[str]:
+        """What a user should know before the run."""
 
     def keep(self, directory: Path, system: Any, state: Any, collector: Collector, notes: dict[str, Any]) -> None:
         """Write the checkpoint."""
@@ -95,9 +102,17 @@ class MeshSetup:
         """What computes the history."""
         return Observables(self.case, self.mesh, system.d, len(state.slot_of))
 
-    def nodal(self, system: Scheme, state: State, u: Floats) -> tuple[Floats, Numbers, Floats]:
+    def fields(self, system: Scheme, state: State, u: Floats, collector: Collector) -> Fields | None:
         """See `Setup`."""
-        return u[:, 0], *owners(u, state)
+        owner = collector.blocks(state.owner)
+        whole = collector.whole(np.ascontiguousarray(u[:, : 1 + owner.shape[1]]), everywhere=True)
+        if whole is None or collector.first == collector.last:
+            return None
+        return fields_of(at_nodes(self.case, self.mesh, slice(collector.first, collector.last), whole), owner)
+
+    def remarks(self) -> list[str]:
+        """See `Setup`."""
+        return list(remarks(self.case, self.mesh))
 
     def keep(self, directory: Path, system: Scheme, state: State, collector: Collector, notes: dict[str, Any]) -> None:
         """Write the checkpoint."""

@@ -48,6 +48,16 @@ class ShapeTable:
         """Room for the longest row, in whole packs."""
         return int(padded(np.diff(self.offsets).max(initial=0)))
 
+    def of(self, p: int) -> tuple[Numbers, Floats]:
+        """The nodes that a point sees, and their N there."""
+        seen = self.nodes[self.offsets[p] : self.offsets[p + 1]]
+        return seen, self.table[0, self.rows[p] : self.rows[p] + seen.size]
+
+    def part(self, points: slice) -> "ShapeTable":
+        """Some points, one after the other."""
+        offsets = self.offsets[points.start : points.stop + 1]
+        return ShapeTable(offsets, self.nodes, self.rows[points], self.table)
+
     def entries(self) -> Floats:
         """(N, grad N) of every entry, in the order of `nodes`: (1 + dim, e)."""
         counts = np.diff(self.offsets)

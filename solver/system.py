@@ -20,8 +20,11 @@ class Progress(Protocol):
 
 
 class System(Protocol):
-    """One rank's part of the equations. Every method is collective. What a run asks of it between steps are `run.renew`,
-    `run.check` and `run.piled_up`, functions with an implementation per system."""
+    """One rank's part of the equations. Every method is collective.
+
+    What a run asks of it between steps are functions with an implementation per system: `run.renew`, `run.check`,
+    `run.piled_up`.
+    """
 
     relax: Callable[[Floats], Floats]
     """the motion of the particles from the free one; an integrator takes back what a rejected step made of it"""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import Flags, Floats, Integers, Numbers
+from .arrays import Floats, Integers, Numbers
 from .jit import jit
 from .partition import Halo
 from .simd import flush_denormals, restore_denormals
@@ -189,16 +189,3 @@ def step_error(
         sums[0] += square
         if strips.particle[r] < 0:
             sums[1] += volume
-
-
-@jit
-def first_outside(y: Floats, strips: Strips, at_wall: Flags, low: float, high: float, rho_at_wall: float) -> int:
-    """The first node with a field outside [low, high] or not a number, or -1; for rho at walls high differs."""
-    found = at_wall.size
-    for r in range(strips.node.size):
-        rho = strips.particle[r] < 0
-        begin, a = strips.first[r], strips.node[r]
-        for k in range(strips.first[r + 1] - begin):
-            if not (low <= y[begin + k] <= (rho_at_wall if rho and at_wall[a + k] else high)):
-                found = min(found, a + k)
-    return int(found) if found < at_wall.size else -1

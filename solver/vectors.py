@@ -46,3 +46,12 @@ def largest_change(y: Floats, reference: Floats, weight: Floats) -> float:
     for i in range(y.size):
         largest = max(largest, weight[i] * abs(y[i] - reference[i]))
     return largest
+
+
+@jit
+def within(y: Floats, low: float, high: float) -> bool:
+    """Whether all values are numbers in [low, high]."""
+    inside = True
+    for i in range(y.size):
+        inside &= low <= y[i] <= high
+    return inside

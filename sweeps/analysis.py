@@ -55,8 +55,11 @@ class Run:
         return xr.open_dataset(self.directory / "snapshots.zarr", engine="zarr", chunks=None)
 
     def row(self) -> dict[str, Any]:
-        """Job, name, state, ranks, every scalar of the case, what its packing realised, the last row of the history."""
-        about = {"job": self.job, "name": self.case["name"]} | {key: self.record.get(key) for key in ("state", "ranks")}
+        """Job, name, what run.json tells in a word, every scalar of the case, what its packing realised, the last row
+        of the history.
+        """
+        told = {key: self.record.get(key) for key in ("state", "ranks", "revision")}
+        about = {"job": self.job, "name": self.case["name"]} | told
         scalars = {
             _column(table, key): value
             for table, values in self.case.items()

@@ -9,6 +9,7 @@ particles nothing was measured. Compiling and packing are left out.
 """
 
 import json
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import ceil, exp, log, pi, prod, sqrt
@@ -28,6 +29,7 @@ START = 3.0  # s: command, interpreter, imports, compiled kernels from disk
 SET_UP = 2.0e-7  # s per point and node in range: mesh, neighbours, shape functions
 ROW, ROW_POINT = 5e-3, 3e-7  # s per history row, and more per point
 VISIT = 1.1e-8  # s per live point, node in range and evaluation
+FACTORED = {2: 8.0, 3: 11.0}  # nodes in range that cost as much where sums go axis by axis; measured on packs
 BAND = 14.0  # nm: width of what is live along a surface, both sides together
 FIRST = 10.0  # evaluations: first steps, and the first estimate of the spectral radius
 FIT = 43.0  # evaluations per (spectral radius)^STIFF x (model time)^GROWTH
@@ -74,8 +76,25 @@ def work(case: Case) -> Work:
     """The work of a resolved case, as a tree of plain values."""
     h, size = _spacing(case), case["domain"]["size"]
     in_cell = 4 / sqrt(3) if len(size) == 2 else 4.5 * sqrt(3)  # points per h^dim of the built-in lattices
+    if factored(case):
+        in_cell = 2.0
+    cells = in_cell * prod(size) / h ** len(size)
+    points = points_of(case, cells / amounts.points(1, len(size)), cells)
     rows = case["time"]["end"] / case["output"]["history_every"]
-    return Work(in_cell * prod(size) / h ** len(size), nodes_in_range(case), _live(case), evaluations(case), rows)
+    return Work(points, nodes_in_range(case, h), _live(case), evaluations(case), rows)
+
+
+def points_of(case: Case, nodes: float, cells: float) -> float:
+    """Material points on that many nodes with that many cells: one in each, or on a lattice of their own."""
+    size, points = case["domain"]["size"], case.get("points", {})  # which cases of old have not
+    if factored(case):
+        return 2.0 * nodes
+    on_mesh = case["nodes"]["source"] in ("lattice", "triangular") or case["shape_functions"]["kind"] == "linear"
+    if on_mesh or points.get("source") == "cells":
+        return cells
+    if (pitch := points.get("pitch")) is not None:
+        return prod(amounts.quotient(length, pitch) for length in size)
+    return nodes * amounts.POINTS ** len(size)
 
 
 def evaluations(case: Case) -> float:
@@ -111,12 +130,20 @@ def _spacing(case: Case) -> float:
     return float(case["nodes"].get("spacing") or min(case["domain"]["size"]) / 50)
 
 
-def nodes_in_range(case: Case) -> float:
-    """Nodes within h sqrt(-ln(delta_0) / gamma) of a point; the corners of a cell with linear functions."""
-    dim, reach = len(case["domain"]["size"]), _reach(case["shape_functions"])
-    if case["shape_functions"]["kind"] == "linear":
+def nodes_in_range(case: Case, spacing: float) -> float:
+    """Nodes, so far from each other, within h sqrt(-ln(delta_0) / gamma) of a point; of linear functions, of a cell."""
+    dim, shape = len(case["domain"]["size"]), case["shape_functions"]
+    if shape["kind"] == "linear":
         return dim + 1.0
+    if factored(case):
+        return FACTORED[dim]
+    reach = _reach(shape) * (shape.get("width") or spacing) / spacing
     return pi * reach**2 * 2 / sqrt(3) if dim == 2 else 4 / 3 * pi * reach**3 * 0.75 * sqrt(3)
+
+
+def factored(case: Case) -> bool:
+    """Whether sums go axis by axis: on a square or cubic lattice, with maximum-entropy functions."""
+    return bool(case["nodes"]["source"] == "lattice" and case["shape_functions"]["kind"] == "lme")
 
 
 def _reach(shape: Case) -> float:
@@ -126,7 +153,7 @@ def _reach(shape: Case) -> float:
 
 def _live(case: Case) -> float:
     """Share of live points: a band along every surface, while bands leave room between them."""
-    if not case["activation"]["enabled"]:
+    if not case["activation"]["enabled"] or factored(case):
         return 1.0
     size = case["domain"]["size"]
     volume, surface = prod(size), _surface(case["particles"], len(size))
@@ -238,6 +265,8 @@ class Plan:
     """points left out as an earlier one is the same case"""
     done: int
     """cases that have been computed before"""
+    older: dict[str, int]
+    """by revision of the solver: how many cases an older one has computed, and are not to be computed anew"""
     to_run: int
     """cases that are missing"""
     core_hours: float
@@ -250,10 +279,12 @@ class Plan:
     def rows(self) -> list[tuple[str, str]]:
         """The plan as a table of words and figures."""
         hours = f"{self.core_hours:.2g} ({self.source})" if self.to_run else "0"
+        older = ", ".join(f"{n} by revision {revision}" for revision, n in self.older.items())
         return [
             ("points", f"{self.points + self.duplicates}"),
             ("duplicates", f"{self.duplicates}"),
             ("already done", f"{self.done}"),
+            *([("by an older solver", f"{older}; --recompute computes them anew")] if older else []),
             ("to run", f"{self.to_run}"),
             ("core-hours", hours),
             ("ranks kept busy", ", ".join(f"{ranks}: {part:.0%}" for ranks, part in self.busy.items()) or "-"),
@@ -268,14 +299,25 @@ def busy(case: Case) -> dict[str, float]:
     """Ranks, and the part of their time that is work, for a resolved case; see `scaling`."""
     said, size = work(case), tuple(case["domain"]["size"])
     nodes = said.points / (2 if len(size) == 2 else 6)  # of the built-in lattices
-    reach, particles = _reach(case["shape_functions"]) * _spacing(case), _particles(case["particles"], len(size))
+    shape = case["shape_functions"]
+    reach, particles = _reach(shape) * (shape.get("width") or _spacing(case)), _particles(case["particles"], len(size))
     found = efficiencies(size, nodes, reach, said.evaluation(), particles)
     return {str(ranks): part for ranks, part in found.items()}
 
 
-def plan(expansion: Expansion, past: Sequence[Measured] = (), done: Collection[str] = ()) -> Plan:
-    """The plan of an expanded sweep; `done` are the identities of cases that need not be computed."""
-    missing = [point for point in expansion.points if point.identity not in done]
+def plan(
+    expansion: Expansion,
+    past: Sequence[Measured] = (),
+    done: Collection[str] = (),
+    older: Mapping[str, int] | None = None,
+) -> Plan:
+    """The plan of an expanded sweep; `done` are the identities of cases that need not be computed, `older` those of
+    cases that another revision of the solver has computed, which one, and that are not to be computed anew.
+    """
+    by = dict(older or {})
+    stale = Counter(str(by[point.identity]) for point in expansion.points if point.identity in by)
+    kept = {*done, *by}
+    missing = [point for point in expansion.points if point.identity not in kept]
     experience = Experience(past)
     cases = [json.loads(point.case) for point in missing]
     guesses = [experience.estimate(case) for case in cases]
@@ -287,7 +329,8 @@ def plan(expansion: Expansion, past: Sequence[Measured] = (), done: Collection[s
         busy=busy(costliest[1]) if costliest else {},
         points=len(expansion.points),
         duplicates=expansion.duplicates,
-        done=len(expansion.points) - len(missing),
+        done=len(expansion.points) - len(missing) - stale.total(),
+        older=dict(sorted(stale.items())),
         to_run=len(missing),
         core_hours=sum(guess.core_seconds for guess in guesses) / 3600,
         source=source,

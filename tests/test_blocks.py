@@ -95,10 +95,10 @@ def grains(dim: int, activation: dict[str, Any], model: dict[str, Any]) -> Case:
     """Two touching pairs, and room in which nothing happens."""
     if dim == 2:
         centres = [[4.0, 4.0], [4.2, 8.9], [16.0, 4.0], [16.1, 8.9]]
-        tree: dict[str, Any] = {"domain": {"size": [40.0, 14.0]}, "nodes": {"spacing": 0.6}}
+        tree: dict[str, Any] = {"domain": {"size": [40.0, 14.0]}, "nodes": {"source": "triangular", "spacing": 0.6}}
     else:
         centres = [[4.0, 4.0, 3.6], [4.2, 8.7, 3.5], [17.0, 4.0, 3.5], [17.1, 8.7, 3.4]]
-        tree = {"domain": {"size": [36.0, 13.0, 7.0]}, "nodes": {"spacing": 0.8}}
+        tree = {"domain": {"size": [36.0, 13.0, 7.0]}, "nodes": {"source": "triangular", "spacing": 0.8}}
     return parse_case(
         tree
         | {
@@ -165,7 +165,7 @@ def test_more_particles_than_a_word_has_bits(ranks: Ranks, monkeypatch: pytest.M
     """72 discs far apart, a column each: the same points live as where each is asked by itself."""
     case = parse_case({
         "domain": {"size": [132.0, 88.0]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {
             "centres": [[6.0 + 11.0 * (k % 12), 6.0 + 15.0 * (k // 12)] for k in range(72)],
             "radii": [2.5] * 72,
@@ -228,7 +228,7 @@ def test_expected_work_counts_the_fields_that_exist(ranks: Ranks) -> None:
     case = parse_case(
         {
             "domain": {"size": [60.0, 30.0]},
-            "nodes": {"spacing": 1.0},
+            "nodes": {"source": "triangular", "spacing": 1.0},
             "particles": {"centres": [[20.0, 15.0], [36.0, 15.0]], "radii": [8.0, 8.0]},
             "time": {"end": 1.0},
         }

@@ -120,7 +120,7 @@ def test_few_rows_of_nodes_give_the_degree_that_they_determine(height: float, de
 def test_a_single_cell_integrates_linear_fields() -> None:
     nodes = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
     cells = np.arange(3, dtype=np.int32)[None]
-    mesh = Mesh(nodes, cells, nodes.mean(axis=0)[None], np.array([8.0]), np.array([4.0]))
+    mesh = Mesh(nodes, cells, nodes.mean(axis=0)[None], np.array([8.0]), np.array([4.0]), 4.0, True)
     low, high = np.array([0.5, 0.7]), np.array([1.5, 1.2])
     assert error(mesh, low, high, polynomial(1, (4.0, 4.0), seed=1), False) < 1e-13
 
@@ -196,7 +196,7 @@ def test_any_number_of_ranks_measures_the_same(tmp_path: Path, dim: int) -> None
     low, high, centre = 0.21 * np.array(size), 0.77 * np.array(size), 0.5 * np.array(size) + 0.13
     case: Case = {
         "domain": {"size": list(size)},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "shape_functions": {"kind": "linear"},  # the quickest: the weights know nothing of shape functions
         "particles": {"centres": [centre.tolist()], "radii": [radius]},
         "time": {"integrator": "rk2", "end": 2e-4, "step": 1e-4},

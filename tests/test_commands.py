@@ -165,7 +165,7 @@ def test_a_run_that_fails_ends_with_1_and_the_reason(folder: Path) -> None:
     status, out, err = frit(folder, "run", "unstable.json", "--json")
     assert status == 1
     assert json.loads(out)["state"] == "failed"
-    for words in ("step 1, node ", "likely cause", "see runs/unstable/log.txt"):
+    for words in ("step 1, at (", "likely cause", "see runs/unstable/log.txt"):
         assert words in err
 
 
@@ -174,7 +174,7 @@ def test_a_particle_pressed_against_a_wall_is_noted_once(folder: Path) -> None:
     status, out, err = frit(folder, "run", "pressed.json", "--ranks", "2")
     assert status == 0, out + err
     (note,) = record(folder / "runs/pressed")["notes"]
-    assert re.fullmatch(r"at t = 0\.\d+, step \d+, node \d+ at .* nm: rho = 1\.\d+, .*: a particle is pressed .*", note)
+    assert re.fullmatch(r"at t = 0\.\d+, step \d+, at \(.*\) nm: rho = 1\.\d+, .*: a particle is pressed .*", note)
     assert err == f"note: {note}\n"
     log = (folder / "runs/pressed/log.txt").read_text()
     assert log.count("note: ") == log.count(note) == 1

@@ -164,6 +164,18 @@ def test_a_plan_counts_what_is_missing() -> None:
     assert json.loads(json.dumps(found.as_dict())) == found.as_dict()
 
 
+def test_a_plan_tells_what_an_older_solver_computed() -> None:
+    sweep = pack_sweep(0.4, 0.5, 0.6, 0.7)
+    a, b, c, _ = [point.identity for point in sweep.points]
+    found = plan(sweep, done={a}, older={b: 2, c: 1, "something else": 1})
+    assert (found.done, found.to_run, found.older) == (1, 1, {"1": 1, "2": 1})
+    words = "1 by revision 1, 1 by revision 2; --recompute computes them anew"
+    assert found.rows()[2:5] == [("already done", "1"), ("by an older solver", words), ("to run", "1")]
+    anew = plan(sweep, done={a})
+    assert (anew.to_run, anew.older) == (3, {})
+    assert anew.core_hours > 2 * found.core_hours
+
+
 def test_a_plan_says_what_its_hours_rest_on() -> None:
     sweep = pack_sweep(0.4, 0.5)
     past = [Measured(json.loads(sweep.points[0].case), 7200.0)]

@@ -1,8 +1,6 @@
 """Meshes: the lattices against crystallography and topology, files and gmsh against what went into them."""
 
-import os
 import threading
-from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,17 +26,6 @@ INSTALL = "apt-get install libglu1-mesa libgl1 libxrender1 libxcursor1 libxft2 l
 A = 2 / np.sqrt(3)  # cube edge of the body-centred lattice with nearest neighbours at distance 1
 ROW = np.sqrt(3) / 2  # distance of the rows of the triangular lattice
 SIZES = [(5.2, 4.0), (1.0, 0.2), (0.3, 7.0), (4.0, 5.0, 3.3), (0.2, 3.0, 1.5), (1.0, 1.0, 1.0)]
-
-
-@pytest.fixture
-def gmsh() -> Any:
-    """gmsh, or skip; with FRIT_REQUIRE_ALL=1 a machine that cannot import it fails instead."""
-    try:
-        return import_module("gmsh")
-    except (ImportError, OSError) as error:
-        if os.environ.get("FRIT_REQUIRE_ALL") == "1":
-            raise
-        pytest.skip(f"{error}: {INSTALL}")
 
 
 def edge_lengths(mesh: Mesh) -> Floats:
@@ -366,7 +353,7 @@ def test_make_mesh_calls_the_source_of_the_case(
     spacing, path = (None, "a.msh") if source == "file" else (0.5, None)
     nodes: Any = SimpleNamespace(source=source, spacing=spacing, path=path)
     make_mesh(nodes, (3.0, 2.0))
-    expected = {"file": ("a.msh", (3.0, 2.0)), "lattice": ((3.0, 2.0), 0.5, True), "gmsh": ((3.0, 2.0), 0.5)}
+    expected = {"file": ("a.msh", (3.0, 2.0), True), "lattice": ((3.0, 2.0), 0.5, True), "gmsh": ((3.0, 2.0), 0.5)}
     assert called == [expected[source]]
     nothing: Any = SimpleNamespace(source=source, spacing=None, path=None)
     with pytest.raises(MeshError, match=f"source {source}"):

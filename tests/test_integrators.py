@@ -66,7 +66,7 @@ VALUES = np.linspace(0.2, 2.0, 10)
 def discs(**time: Any) -> Case:
     return parse_case({
         "domain": {"size": [17.0, 10.0]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"centres": [[5.2, 5.0], [11.3, 5.0]], "radii": [3.0, 3.2]},
         "time": {"end": 1.0} | time,
     })  # fmt: skip
@@ -400,7 +400,7 @@ def test_steps_allocate_nothing_that_grows_with_the_mesh(ranks: Ranks) -> None:
     each particle and its contacts."""
     case = parse_case({
         "domain": {"size": [60.0, 40.0]},
-        "nodes": {"spacing": 0.4},
+        "nodes": {"source": "triangular", "spacing": 0.4},
         "particles": {"centres": [[20.0, 20.0], [40.0, 20.0]], "radii": [10.0, 10.0]},
         "time": {"end": 1.0},
     })  # fmt: skip

@@ -1,5 +1,6 @@
 """Versions of the index: a stored old one is refused by name, upgraded whole or not at all, and kept."""
 
+import json
 import os
 import shutil
 import signal
@@ -25,6 +26,7 @@ from frit.service.engine import take
 from frit.service.jobs import State
 from frit.service.migrations import IndexVersionError
 from frit.service.schema import metadata
+from frit.solver.revision import FIRST
 
 NEWEST = migrations.versions(Path("there is none"))[1]
 
@@ -71,6 +73,14 @@ def test_the_command_upgrades_it_and_keeps_every_row_and_a_copy(old: Path) -> No
     assert (status, printed) == (0, f"{path}: version {NEWEST}, was 0001, which is kept as {path}.0001\n")
     after = content(path)
     assert [row.pop("duplicates") for row in after["sweeps"]] == [0, 0]
+    tried = [row["attempt"] > 0 for row in before["jobs"]]
+    assert set(tried) == {True, False}
+    results = [json.loads(row["result"]) for row in after["jobs"]]
+    assert [result.pop("revision", None) for result in results] == [FIRST if ran else None for ran in tried]
+    for row, result in zip(after["jobs"], results, strict=True):
+        row["result"] = json.dumps(result)
+    for row in before["jobs"]:
+        row["result"] = json.dumps(json.loads(row["result"]))
     assert after == before == content(Path(f"{path}.0001"))
     assert (version(path), version(Path(f"{path}.0001"))) == (NEWEST, "0001")
     assert is_whole(path)

@@ -8,7 +8,7 @@ from simulate import Result, merged, simulate
 
 PAIR: dict[str, Any] = {
     "domain": {"size": [60.0, 40.0]},
-    "nodes": {"source": "lattice", "spacing": 1.0},
+    "nodes": {"source": "triangular", "spacing": 1.0},
     "particles": {"source": "list", "centres": [[20.0, 20.0], [40.0, 20.0]], "radii": [10.0, 10.0]},
     "time": {"end": 1.0},
     "output": {"history_every": 0.1, "vacancy_box": [[12.0, 12.0], [48.0, 28.0]]},
@@ -59,7 +59,7 @@ def test_turned_pair_has_the_same_neck(radius: float, spacing: float, times: tup
         return simulate(
             {
                 "domain": {"size": [side, side]},
-                "nodes": {"source": "lattice", "spacing": spacing},
+                "nodes": {"source": "triangular", "spacing": spacing},
                 "particles": {
                     "source": "list",
                     "centres": [(middle - shift).tolist(), (middle + shift).tolist()],
@@ -89,7 +89,7 @@ def test_single_disc_stays_put() -> None:
 
 SPHERES: dict[str, Any] = {
     "domain": {"size": [34.0, 20.0, 20.0]},
-    "nodes": {"source": "lattice", "spacing": 1.3},
+    "nodes": {"source": "triangular", "spacing": 1.3},
     "shape_functions": {"gamma": 2.5},
     "particles": {"source": "list", "centres": [[11.0, 10.0, 10.0], [23.0, 10.0, 10.0]], "radii": [6.0, 6.0]},
     "time": {"end": 0.3},
@@ -124,7 +124,7 @@ def ten_discs(end: float) -> dict[str, Any]:
     places = [(13.0 + 10.0 * (k % 4) + 5.0 * (k // 4 % 2), 13.0 + 5.0 * 3**0.5 * (k // 4)) for k in range(10)]
     return {
         "domain": {"size": [61.0, 44.0]},
-        "nodes": {"source": "lattice", "spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"source": "list", "centres": [list(place) for place in places], "radii": [5.0] * 10},
         "model": {"m_t": 20.0},  # so that rk2 is stable at a step that can be afforded
         "time": {"end": end, "integrator": "rk2", "step": 0.002},

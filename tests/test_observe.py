@@ -11,6 +11,7 @@ from launching import Case
 from reference import mean_in_box
 from scipy.spatial import ConvexHull
 
+from frit.solver import field
 from frit.solver.arrays import Floats
 from frit.solver.case import load_case, parse_case
 from frit.solver.discretisation import Discretisation, discretise
@@ -31,7 +32,7 @@ def tree(size: tuple[float, ...], spacing: float = 1.0, kind: str = "lme", **tab
     middle: dict[str, Any] = {"centres": [[0.5 * s for s in size]], "radii": [0.25 * min(size)]}
     return {
         "domain": {"size": list(size)},
-        "nodes": {"spacing": spacing},
+        "nodes": {"source": "triangular", "spacing": spacing},
         "shape_functions": {"kind": kind},
         "particles": middle,
         "time": {"end": 1.0},
@@ -131,6 +132,25 @@ def test_a_particle_that_the_box_cuts_is_measured_to_a_ten_thousandth(
 ) -> None:
     """Whatever the shape functions smooth: nodal values count as samples."""
     assert cut_error(dim, functions, 1.0, ranks) < 1e-4
+
+
+@pytest.mark.parametrize(("dim", "gamma", "bound"), [(2, 1.8, 1e-5), (2, 4.0, 1e-4), (3, 1.8, 1e-4)])
+def test_on_free_nodes_the_field_is_measured(dim: int, gamma: float, bound: float, ranks: Ranks, gmsh: Any) -> None:
+    """By a rule of its own points, wherever the nodes are: the integral of the field that a run starts from."""
+    size, centre = SIZES[dim], 0.5 * np.array(SIZES[dim]) + 0.13
+    particle = {"centres": [centre.tolist()], "radii": [RADIUS[dim]]}
+    functions = {"kind": "lme", "gamma": gamma}
+    free = tree(size, shape_functions=functions, particles=particle) | {"nodes": {"source": "gmsh", "spacing": 1.0}}
+    case = parse_case(free)
+    mesh = build_mesh(case, ranks)
+    scheme, state = prepare(case, mesh, ranks)
+    low, high = 0.21 * np.array(size), 0.77 * np.array(size)
+    mean = box_weights(case, mesh, scheme.d, low, high) @ state.rho / np.prod(high - low)
+
+    def rho(x: Floats) -> Floats:
+        return field.at(case, mesh, x.reshape(-1, dim), state.rho[:, None])[:, 0].reshape(x.shape[:-1])
+
+    assert mean == pytest.approx(mean_in_box(rho, low, high, {2: 60, 3: 24}[dim]), abs=bound)
 
 
 def test_the_error_of_cut_particles_falls_with_the_fourth_power_of_the_spacing(ranks: Ranks) -> None:

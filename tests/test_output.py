@@ -4,6 +4,7 @@ import json
 import signal
 import stat
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +29,7 @@ from launching import (
     write_case,
 )
 
-from frit.solver import output
+from frit.solver import field, output
 from frit.solver.case import load_case, parse_case
 from frit.solver.geometry import Mesh
 from frit.solver.output import History, Snapshots
@@ -37,8 +38,8 @@ from frit.solver.prepare import build_mesh, prepare
 from frit.solver.state import State
 
 ROW = [
-    "time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "particles", "volumes",
-    "evaluations", "wall_time",
+    "time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "rho_min", "rho_max",
+    "particles", "volumes", "evaluations", "wall_time",
 ]  # fmt: skip
 OF_A_PAIR = ["neck_length", "centre_distance"]
 TRIPLE = PAIR | {
@@ -85,6 +86,7 @@ def test_a_row_of_a_pair(pair: Path) -> None:
     assert (last["particles"], len(last["volumes"])) == (2, 2)
     assert 0.0 < last["live_fraction"] <= 1.0
     assert 0.0 < last["vacancy_ratio"] < 0.3
+    assert -0.05 < last["rho_min"] < 0.01 < 0.99 < last["rho_max"] < 1.1
     assert 0.0 < last["neck_length"] < 8.0  # at most the smaller disc's diameter
     assert last["centre_distance"] == pytest.approx(8.9, abs=0.5)
     assert all(a["wall_time"] <= b["wall_time"] for a, b in pairwise(rows))
@@ -173,8 +175,10 @@ def test_snapshots_hold_the_fields_at_the_times_asked_for(pair: Path) -> None:
     assert ((found["particle"][0] >= 0) == solid).all()
     away = [np.linalg.norm(mesh.nodes - c, axis=1) - r for c, r in zip([[6.5, 6.2], [15.4, 6.8]], [5, 4], strict=True)]
     assert (found["particle"][0][solid] == np.argmin(away, axis=0)[solid]).all()
-    # sum eta^2 is 1 in a particle and 0 outside: the tails of the profile, exp(-2 d / xi), at 4 nm.
-    assert found["eta_squared"][0][np.min(away, axis=0) < -4.0] == pytest.approx(1.0, abs=2 * np.exp(-8.0))
+    # sum eta^2 is 1 in a particle and 0 outside: the tails of the profile, exp(-2 d / xi), at 4 nm, which the functions
+    # smooth: means over a variance s^2 = 1 / (2 gamma) nm^2 along each axis multiply exp(2 r) by
+    # exp((4 + 2 / r) s^2 / 2), which is 2.3 where r, the distance from the middle of a disc, is 1 nm.
+    assert found["eta_squared"][0][np.min(away, axis=0) < -4.0] == pytest.approx(1.0, abs=2.3 * 2 * np.exp(-8.0))
     assert found["eta_squared"][0][np.min(away, axis=0) > 4.0] == pytest.approx(0.0, abs=np.exp(-8.0))
 
 
@@ -225,7 +229,9 @@ def test_a_snapshot_is_invisible_until_it_is_complete(
     assert before == [{0}, {1}, {2}]
     found = zarr.open_group(snapshot.path, mode="r")
     assert np.asarray(found["time"]).tolist() == [0.0, 0.5, 1.0]
-    np.testing.assert_array_equal(np.asarray(found["rho"])[2], state.rho)
+    exact = field.at(snapshot.case, snapshot.mesh, snapshot.mesh.nodes, state.u)
+    np.testing.assert_allclose(np.asarray(found["rho"])[2], exact[:, 0], rtol=0, atol=1e-13)
+    assert np.abs(exact[:, 0] - state.rho).max() > 0.01  # the field, not the coefficients
 
 
 @pytest.mark.parametrize("moment", ["_publish", "consolidate"])
@@ -248,13 +254,26 @@ def test_a_snapshot_cut_short_is_written_again(
     assert seen(snapshot.path) == {1}
 
 
-def test_values_at_half_belong_to_the_particle(writer: tuple[Snapshots, State]) -> None:
+def test_a_snapshot_out_of_turn_gives_way_to_those_that_were_asked_for(writer: tuple[Snapshots, State]) -> None:
+    """That of a failure comes behind those before it; a resumed run, which gets farther, writes over it."""
+    snapshot, state = writer
+    snapshot.write(0, 0.0, state, state.u)
+    for time in (0.003, 0.0034):
+        snapshot.keep(replace(state, time=time))
+        group = zarr.open_group(snapshot.path, mode="r")
+        assert np.asarray(group["time"]).tolist() == [0.0, time]
+    snapshot.write(1, 0.0035, state, 0.5 * state.u)
+    group = zarr.open_group(snapshot.path, mode="r")
+    assert np.asarray(group["time"]).tolist() == [0.0, 0.0035]
+    np.testing.assert_allclose(np.asarray(group["rho"])[1], 0.5 * np.asarray(group["rho"])[0], rtol=1e-13)
+
+
+def test_values_at_half_belong_to_the_particle() -> None:
     """rho = 1/2 is solid: the owner is the particle with the largest eta, wherever its slot is."""
-    _, state = writer
     u = np.zeros((3, 8))
     u[:, :3] = [[0.5, 0.2, 0.3], [0.49, 0.2, 0.3], [0.9, 0.8, 0.1]]
     owner = np.array([[4, 7], [4, 7], [7, 4]], dtype=np.int32)
-    particle, eta_squared = output.owners(u, State(0.0, 0, 0, u, owner, state.slot_of))
+    particle, eta_squared = output.owners(u, owner)
     assert particle.tolist() == [7, -1, 7]
     assert relative(np.array([0.13, 0.13, 0.65]), eta_squared) < 1e-15
 

@@ -1,5 +1,10 @@
 """Packings against what is known of packings. The large ones are slow tests."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +15,7 @@ from frit.solver.case import Case, CaseError, parse_case
 from frit.solver.heap import Heap
 from frit.solver.pack_measures import density_profile, near_pairs, solid_fraction, touching
 from frit.solver.packing import OVERLAP, TOLERANCE, Packing, make, request
+from frit.solver.radii import BITS, steady
 
 
 def case(size: list[float], **particles: Any) -> Case:
@@ -99,6 +105,58 @@ def test_a_seed_is_a_packing() -> None:
     assert np.array_equal(first.centres, again.centres)
     assert np.array_equal(first.radii, again.radii)
     assert not np.array_equal(first.centres, other.centres)
+
+
+PLAIN = {  # as little of the processor as can be asked for: in compiled code, the system's library, numpy and BLAS
+    "NUMBA_CPU_NAME": "generic",
+    "NUMBA_CPU_FEATURES": "",
+    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX512F",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "OPENBLAS_CORETYPE": "Nehalem",
+}
+KINDS: list[tuple[list[float], dict[str, Any]]] = [
+    ([9.0, 9.0, 10.0], {"std_radius": 0.2, "count": 60, "friction": 0.4, "seed": 2}),
+    ([24.0, 20.0], {"std_radius": 0.1, "packing_density": 0.7, "seed": 1}),
+    ([10.0, 8.0, 9.0], {"std_radius": 0.25, "distribution": "lognormal", "count": 80, "method": "density", "seed": 3}
+     | {"exchange": True}),
+]  # fmt: skip
+ELSEWHERE = """
+import json
+from numba import config
+from test_packing import KINDS, case
+from frit.solver.packing import make, request
+made = [make(request(case(size, **asked))) for size, asked in KINDS]
+print(json.dumps({
+    "processor": config.CPU_NAME,
+    "made": [[m.centres.tobytes().hex(), m.radii.tobytes().hex()] for m in made],
+}))
+"""
+
+
+def test_a_packing_is_the_same_on_every_processor() -> None:
+    """To the last bit: poured with friction, pressed, and shaken with a log-normal spread. No fused multiplication, no
+    other order of a sum, and no last bit of a logarithm decides where a particle ends."""
+    command = [sys.executable, "-c", ELSEWHERE]
+    there = subprocess.run(
+        command, cwd=Path(__file__).parent, env=os.environ | PLAIN, capture_output=True, text=True, check=False
+    )
+    assert there.returncode == 0, there.stderr
+    found = json.loads(there.stdout)
+    assert found["processor"] == "generic"
+    made = [make(request(case(size, **asked))) for size, asked in KINDS]
+    for (size, _), packing, (centres, radii) in zip(KINDS, made, found["made"], strict=True):
+        assert np.array_equal(packing.radii, np.frombuffer(bytes.fromhex(radii)))
+        there_too = np.frombuffer(bytes.fromhex(centres)).reshape(-1, len(size))
+        assert np.array_equal(packing.centres, there_too)
+
+
+def test_what_is_made_steady_keeps_its_value_and_loses_its_last_bits() -> None:
+    x = np.random.default_rng(1).normal(size=1000) * 10.0 ** np.arange(-10, 10).repeat(50)
+    np.testing.assert_allclose(steady(x), x, rtol=2.0**-BITS)
+    assert (steady(np.nextafter(x, np.inf)) == steady(x)).mean() > 0.999
+    assert (steady(x) != x).all()
+    assert steady(steady(x)).tolist() == steady(x).tolist()
+    assert steady([0.0, 1.0, -2.5]).tolist() == [0.0, 1.0, -2.5]
 
 
 # --- what cannot be

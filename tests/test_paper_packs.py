@@ -35,7 +35,7 @@ def placed(name: str) -> Case:
 def vacancy_ratio(case: Case, spacing: float) -> float:
     """R_v = 1 - int rho / V of the initial fields on a lattice of this spacing."""
     case = case.model_copy(
-        update={"nodes": Nodes(spacing=spacing), "shape_functions": ShapeFunctions(kind="linear")}
+        update={"nodes": Nodes(source="triangular", spacing=spacing), "shape_functions": ShapeFunctions(kind="linear")}
     )
     mesh = make_mesh(case.nodes, case.domain.size)
     low, high = (np.array(corner) for corner in case.output.vacancy_box)

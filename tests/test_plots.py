@@ -188,3 +188,15 @@ def test_a_name_is_never_a_formula_nor_a_page(tmp_path: Path) -> None:
     curves.write(tmp_path / "a.png", "vacancy_ratio", made)
     curves.write(tmp_path / "a.html", "vacancy_ratio", made)
     assert "alert(1)</script>" not in (tmp_path / "a.html").read_text()
+
+
+def test_crowded_nodes_are_thinned_and_even_ones_are_not() -> None:
+    """Columns 0.01 nm apart: the nine nearest nodes would all lie on one line."""
+    even = scattered([20.0, 12.0], 1.0)
+    assert plots.thinned(even).sum() > 0.95 * len(even)
+    columns = np.sort(np.concatenate([np.arange(0.0, 20.0, 2.0), np.arange(0.0, 20.0, 2.0) + 0.01]))
+    paired = np.stack(np.meshgrid(columns, np.arange(0.0, 12.0, 1.0)), axis=-1).reshape(-1, 2)
+    kept = paired[plots.thinned(paired)]
+    assert len(kept) == len(paired) / 2
+    near = np.asarray(cKDTree(kept).query(np.array([9.0, 6.0]), 9)[1])
+    assert len(np.unique(kept[near, 0])) > 1

@@ -3,7 +3,9 @@
 from pathlib import Path
 
 import pytest
-from launching import PAIR, Case, Tree, columns, different, launch, record, solve, write_case
+from launching import PAIR, Case, Tree, columns, different, launch, record, snapshots, solve, write_case
+
+from frit.sweeps.plots import plot_snapshot
 
 # Three particles, each touching both others, all of different size: rigid motion with rotation. 100 steps.
 TRIPLE: dict[int, Case] = {
@@ -159,14 +161,18 @@ def test_an_exception_on_one_rank_ends_all(tmp_path: Path, rank: int) -> None:
 
 def test_a_bad_state_on_one_rank_ends_all_with_time_and_place(tmp_path: Path) -> None:
     """No abort: every rank learns of it, and the checkpoint of before stands."""
-    case = PAIR | {"time": {"integrator": "rk2", "end": 10.0, "step": 0.5}, "output": {"history_every": 0.5}}
+    case = PAIR | {"time": {"integrator": "rk2", "end": 10.0, "step": 0.5}}
+    case["output"] = {"history_every": 0.5, "snapshots": [0.0]}
     with launch(case, tmp_path / "run", ranks=2) as tree:
         status, printed = tree.ended()
     assert status == 1, printed
     ended = record(tmp_path / "run")
     assert ended["state"] == "failed"
-    for words in ("step 1, node ", "rho = ", "likely cause: ", "the last good checkpoint is at t = 0"):
+    for words in ("step 1, at (", "rho = ", "likely cause: ", "good checkpoint is at t = 0, the last snapshot at 0.5"):
         assert words in ended["message"]
+    assert snapshots(tmp_path / "run")["time"].tolist() == [0.0, 0.5]
+    plot_snapshot(tmp_path / "run", 0.5, tmp_path / "moment.png")
+    assert (tmp_path / "moment.png").stat().st_size > 10_000
     assert (tmp_path / "run/checkpoint.h5").exists()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import launching
 import numpy as np
 import pytest
+import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +26,7 @@ def discs(model: dict[str, Any] | None = None, output: dict[str, Any] | None = N
     """Two touching discs of 3 nm: a few milliseconds per step."""
     return parse_case({
         "domain": {"size": [17.0, 10.0]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"centres": [[5.2, 5.0], [11.3, 5.0]], "radii": [3.0, 3.2]},
         "time": {"end": 1.0} | time,
         "model": model or {},
@@ -175,7 +176,7 @@ def test_who_asks_for_the_end_at_the_end_gets_a_finished_run(ranks: Ranks) -> No
 CAUSE = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
 STIFF = ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
 MESSAGE = re.compile(
-    r"at t = (?P<time>[-\d.e]+), step (?P<step>\d+), node (?P<node>\d+) at \((?P<place>[-\d., ]+)\) nm: "
+    r"at t = (?P<time>[-\d.e]+), step (?P<step>\d+), at \((?P<place>[-\d., ]+)\) nm: "
     r"rho = (?P<rho>\S+?)(?P<eta>(, eta of particle \d+ = \S+?)*) left \[-0\.5, 1\.5\]; likely cause: (?P<cause>.*)"
 )
 
@@ -195,53 +196,95 @@ def test_a_step_far_too_long_ends_with_time_place_and_cause(ranks: Ranks, rigid:
     assert float(said["time"]) == pytest.approx(state.time, rel=1e-5)
     assert int(said["step"]) == state.step >= 1
     assert said["cause"] == CAUSE + (STIFF if rigid else "")
-    node = int(said["node"])
-    np.testing.assert_allclose([float(x) for x in said["place"].split(",")], mesh.nodes[node], atol=5e-4)
-    assert float(said["rho"]) == pytest.approx(state.u[node, 0], rel=1e-3)
+    place = [float(x) for x in said["place"].split(",")]
+    fields = shape_at(mesh, place) @ state.u  # the field, not what a node holds
+    assert float(said["rho"]) == pytest.approx(fields[0], rel=1e-2)
     named = {int(a): float(value) for a, value in re.findall(r"eta of particle (\d+) = ([^\s,]+)", said["eta"])}
-    owned = {int(a): state.u[node, 1 + s] for s, a in enumerate(state.owner[node]) if a >= 0}
-    assert named.keys() == owned.keys()
-    assert all(named[a] == pytest.approx(owned[a], rel=1e-3) for a in named)
-    assert not all(-0.5 <= value <= 1.5 for value in (state.u[node, 0], *owned.values()))
+    assert named.keys() <= {0, 1}
+    assert all(named[a] == pytest.approx(fields[1 + state.slot_of[a]], rel=1e-2, abs=1e-3) for a in named)
+    assert not all(-0.5 <= value <= 1.5 for value in (float(said["rho"]), *named.values()))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1.5001, -0.5001])
+def shape_at(mesh: Mesh, place: list[float]) -> Floats:
+    """The functions of all nodes at a place of two discs' lattice; places are told to a thousandth."""
+    return reference.lme(np.array(place), mesh.nodes, 1.0, 1.8, 1e-6)[0]
+
+
+def around(scheme: Scheme, state: State, place: tuple[float, float], column: int, value: float) -> None:
+    """Set a coefficient to the value at all nodes within 5 nm: so is the field within about 2 nm, and every field of
+    that kind owns what it holds."""
+    near = np.linalg.norm(scheme.d.positions - place, axis=1) < 5.0
+    state.u[near, column] = value
+    if column:
+        state.owner[near, column - 1] = np.flatnonzero(state.slot_of == column - 1)[0]
+    scheme.activate(state)
+    state.u[near, column] = value  # what no point sees has been set to zero
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("column", [0, 1, 2])
-def test_a_single_bad_value_is_found(ranks: Ranks, value: float, column: int) -> None:
+def test_a_single_value_that_is_no_number_is_found(ranks: Ranks, value: float, column: int) -> None:
     _, scheme, state = start(discs(), ranks)
     there = state.owner[:, column - 1] >= 0 if column else np.ones(len(state.u), dtype=bool)
-    node = int(np.flatnonzero(~scheme.d.at_wall & there)[41])
+    node = int(np.flatnonzero(there)[41])
     state.u[node, column] = value
-    with pytest.raises(RunError, match=f"node {node} at "):
+    with np.errstate(invalid="ignore"), pytest.raises(RunError, match="step 0, at ") as failure:  # inf - inf
         check(scheme, state, scheme.active.unknowns.take(state.u))
+    place = [float(x) for x in re.findall(r"at \((.*)\) nm", str(failure.value))[0].split(",")]
+    assert np.linalg.norm(scheme.d.positions[node] - place) < 2.8  # in range of the node
+
+
+@pytest.mark.parametrize("value", [1.51, -0.51])
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_a_field_that_is_out_of_range_is_found(ranks: Ranks, value: float, column: int) -> None:
+    _, scheme, state = start(discs(), ranks)
+    around(scheme, state, (8.25, 5.0), column, value)
+    with pytest.raises(RunError, match=re.escape("left [-0.5, 1.5]")):
+        check(scheme, state, scheme.active.unknowns.take(state.u))
+
+
+@pytest.mark.parametrize("value", [2.5, -1.5])
+def test_a_coefficient_is_not_the_field(ranks: Ranks, value: float) -> None:
+    """A node's function is at most 0.28 anywhere inside: one value far out leaves the field in range."""
+    _, scheme, state = start(discs(), ranks)
+    node = int(np.argmin(np.linalg.norm(scheme.d.positions - (8.25, 5.0), axis=1)))
+    state.u[node, 0] = value
+    fields = scheme.d.sample(state.u)[:, 0]
+    assert -0.5 < fields.min() < fields.max() < 1.5
+    check(scheme, state, scheme.active.unknowns.take(state.u))
 
 
 def test_values_at_the_limits_pass(ranks: Ranks) -> None:
+    """Within round-off of a sum of a few dozen."""
     _, scheme, state = start(discs(), ranks)
     check(scheme, state, scheme.active.unknowns.take(state.u))
-    inside, wall = np.flatnonzero(~scheme.d.at_wall), np.flatnonzero(scheme.d.at_wall)
-    state.u[inside[:2], 0], state.u[inside[2], 1] = (1.5, -0.5), 1.5
-    state.u[wall[:2], 0], state.u[wall[2], 1] = (3.0, -0.5), 1.5
-    check(scheme, state, scheme.active.unknowns.take(state.u))
-
-
-@pytest.mark.parametrize(("column", "value"), [(0, 3.0001), (0, -0.5001), (0, float("nan")), (1, 1.5001)])
-def test_there_are_limits_at_walls_too(ranks: Ranks, column: int, value: float) -> None:
-    _, scheme, state = start(discs(), ranks)
-    node = int(np.flatnonzero(scheme.d.at_wall)[7])
-    state.u[node, column] = value
-    limits = rf"\[-0\.5, 3\]; likely cause: {PRESSED}, or" if value > 3.0 else r"\[-0\.5, 1\.5\]; likely cause:"
-    with pytest.raises(RunError, match=rf"node {node} at .* left {limits} {CAUSE}"):
+    for place, column, value in [((8.25, 5.0), 0, 1.5), ((8.25, 5.0), 1, -0.5), ((0.0, 5.0), 0, 2.999)]:
+        _, scheme, state = start(discs(), ranks)
+        around(scheme, state, place, column, value * (1.0 - 1e-12))
+        if value > 1.5:  # only at the wall
+            state.u[scheme.d.positions[:, 0] > 0.9, 0] = np.minimum(state.rho[scheme.d.positions[:, 0] > 0.9], 1.0)
         check(scheme, state, scheme.active.unknowns.take(state.u))
 
 
-def test_walls_are_the_nodes_within_a_spacing(ranks: Ranks) -> None:
+@pytest.mark.parametrize(("column", "value"), [(0, 3.01), (0, -0.51), (1, 1.51)])
+def test_there_are_limits_at_walls_too(ranks: Ranks, column: int, value: float) -> None:
+    _, scheme, state = start(discs(), ranks)
+    around(scheme, state, (0.0, 5.0), column, value)
+    if value > 3.0:  # only at the wall
+        inner = scheme.d.positions[:, 0] > 0.9
+        state.u[inner, 0] = np.minimum(state.rho[inner], 1.0)
+        state.u[~inner, 0] = np.where(state.rho[~inner] > 1.0, 9.0, state.rho[~inner])
+    limits = rf"\[-0\.5, 3\]; likely cause: {PRESSED}, or" if value > 3.0 else r"\[-0\.5, 1\.5\]; likely cause:"
+    with pytest.raises(RunError, match=rf"at \(0\.\d+, .* left {limits} {CAUSE}"):
+        check(scheme, state, scheme.active.unknowns.take(state.u))
+
+
+def test_walls_are_the_points_within_a_spacing(ranks: Ranks) -> None:
     mesh, scheme, _ = start(discs(), ranks)
-    x, y = mesh.nodes.T
+    x, y = mesh.points.T
     near = np.minimum.reduce([x, 17.0 - x, y, 10.0 - y]) <= mesh.spacing.max()
     np.testing.assert_array_equal(scheme.d.at_wall, near)
-    assert near[np.minimum.reduce([x, 17.0 - x, y, 10.0 - y]) < 1e-9].all()
-    assert 0 < near.sum() < len(near) / 2
+    assert 0 < near.sum() < 0.6 * len(near)
 
 
 class Pressed(Log):
@@ -253,7 +296,7 @@ class Pressed(Log):
         self.said: list[str | None] = []
 
     def history(self, scheme: Scheme, state: State, u: Floats, time: float) -> None:
-        self.most.append(float(state.u[:, 0].max()))
+        self.most.append(float(scheme.d.sample(state.u)[:, 0].max()))
         self.said.append(piled_up(scheme, state))
 
 
@@ -266,9 +309,9 @@ def test_a_particle_pressed_against_a_wall_is_no_failure(ranks: Ranks) -> None:
     assert run(scheme, state, make_integrator(case, mesh), log) is Ending.DONE
     most = np.array(log.most)
     assert 1.5 < most.max() < 3.0
-    assert most[0] <= 1.0
+    assert most[0] <= 1.01
     assert most[-1] < most.max() - 0.05
     assert [text is not None for text in log.said] == (most > 1.5).tolist()
     texts = [text for text in log.said if text]
-    assert all(re.fullmatch(rf"at t = .* at \((0\.000|16\.000), .*\) nm: rho = .*: {PRESSED}", text) for text in texts)
+    assert all(re.fullmatch(rf"at t = .* at \((0|15)\.\d+, .*\) nm: rho = .*: {PRESSED}", text) for text in texts)
     assert scheme.d.mass @ state.rho == pytest.approx(mass, rel=1e-12)

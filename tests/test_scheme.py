@@ -31,7 +31,7 @@ def small_case(dim: int, shape: Tree, model: Tree, particles: int = 3, activatio
     """Three touching particles, each of another size; as few points as dense matrices allow."""
     plane = {
         "domain": {"size": [17.0, 15.0]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {
             "centres": [[5.0, 5.1], [11.0, 5.0], [8.0, 10.2]][:particles],
             "radii": [3.1, 2.9, 3.0][:particles],
@@ -39,7 +39,7 @@ def small_case(dim: int, shape: Tree, model: Tree, particles: int = 3, activatio
     }
     space = {
         "domain": {"size": [8.5, 8.2, 6.0]},
-        "nodes": {"spacing": 1.2},
+        "nodes": {"source": "triangular", "spacing": 1.2},
         "particles": {
             "centres": [[2.5, 2.5, 3.0], [6.0, 2.6, 3.2], [4.25, 5.5, 2.9]][:particles],
             "radii": [1.8, 1.7, 1.75][:particles],
@@ -156,7 +156,7 @@ def test_a_symmetric_pair_is_pulled_along_its_axis(ranks: Ranks) -> None:
     """Mirror images: no force across the axis, no torque about the own centres, centres of mass at the centres."""
     case = parse_case({
         "domain": {"size": [16.0, 12 * np.sqrt(3) / 2]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"centres": [[5.0, 3 * np.sqrt(3)], [11.0, 3 * np.sqrt(3)]], "radii": [3.0, 3.0]},
         "time": {"end": 1.0},
         "activation": FULL,
@@ -254,7 +254,7 @@ def test_contact_forces_follow_a_sliding_particle_without_jumps(ranks: Ranks) ->
     for x in np.linspace(17.0, 16.0, 41):
         tree = {
             "domain": {"size": [25.0, 14.0]},
-            "nodes": {"spacing": 1.0},
+            "nodes": {"source": "triangular", "spacing": 1.0},
             "particles": {"centres": [[7.1, 7.0], [x, 7.3]], "radii": [4.8, 4.9]},
             "time": {"end": 1.0},
         }
@@ -291,7 +291,7 @@ def pack_case(shape: Tree, model: Tree = HUANG, activation: Tree = FULL) -> Case
     """Three touching discs large enough to have a still interior, and still corners around them."""
     return parse_case({
         "domain": {"size": [58.0, 54.0]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"centres": [[16.0, 16.0], [40.0, 16.0], [28.0, 36.5]], "radii": [12.0, 12.0, 11.8]},
         "time": {"end": 1.0},
         "shape_functions": shape,
@@ -457,7 +457,7 @@ def test_free_energy_of_more_particles_than_a_word_has_bits(ranks: Ranks) -> Non
     centres = [[1.7 + 3.4 * i, 1.6 + 3.3 * j] for i in range(9) for j in range(8)]
     case = parse_case({
         "domain": {"size": [30.6, 26.5]},
-        "nodes": {"spacing": 0.85},
+        "nodes": {"source": "triangular", "spacing": 0.85},
         "particles": {"centres": centres, "radii": [1.5] * 72, "interface_width": 0.5},
         "time": {"end": 1.0},
         "activation": FULL,

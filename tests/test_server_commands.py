@@ -4,10 +4,11 @@ import json
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +145,33 @@ def test_a_sweep_without_a_server_runs_only_what_is_missing(folder: Path) -> Non
     with serving(folder):
         assert frit("submit", file, "--wait").splitlines()[0] == "s3"
         assert [len(path.read_text().splitlines()) for path in runs] == [1, 1, 1, 1]
+
+
+def test_what_an_older_solver_computed_is_told_and_computed_anew_when_asked(folder: Path) -> None:
+    file, data = sweep(folder, "sleep 0"), folder / "data"
+    before = json.loads(frit("sweep", "run", file, "--data", "data", "--json"))
+    with closing(sqlite3.connect(data / "frit.db")) as index:
+        (count,) = index.execute("SELECT count(*) FROM jobs WHERE json_extract(result, '$.revision') = 1").fetchone()
+        assert count == 3
+        change = "UPDATE jobs SET result = json_set(result, '$.revision', 0) WHERE id IN (?, ?)"
+        index.execute(change, [row["job"] for row in before[:2]])
+        index.commit()
+    plan = json.loads(frit("sweep", "plan", file, "--data", "data", "--json"))
+    assert (plan["done"], plan["older"], plan["to_run"]) == (1, {"0": 2}, 0)
+    assert "2 by revision 0; --recompute computes them anew" in frit("sweep", "plan", file, "--data", "data")
+    anew = json.loads(frit("sweep", "plan", file, "--data", "data", "--recompute", "--json"))
+    assert (anew["done"], anew["older"], anew["to_run"]) == (1, {}, 2)
+    told = "2 of 3 jobs were computed by an older revision of the solver (0)"
+    assert told in frit("sweep", "run", file, "--data", "data")
+    assert told in frit("compare", "sleep 0", "--data", "data")
+    after = json.loads(frit("sweep", "run", file, "--data", "data", "--recompute", "--json"))
+    assert [row["job"] for row in after] == [f"{before[0]['job']}-2", f"{before[1]['job']}-2", before[2]["job"]]
+    assert [row["older_revision"] for row in after] == [None] * 3
+    assert told not in frit("compare", "sleep 0", "--data", "data")  # of a name, the newest
+    with serving(folder):
+        assert frit("submit", file, "--recompute", "--wait").splitlines()[0] == "s4"
+        frit("submit", "case.toml", "--recompute")
+    assert len(list((data / "runs").glob("*/calls"))) == 6
 
 
 def test_ctrl_c_writes_checkpoints_and_the_same_command_goes_on(folder: Path) -> None:

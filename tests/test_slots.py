@@ -153,7 +153,7 @@ def grid_case(
     size = pitch * (across + 0.4) + 0.1 * across
     return parse_case({
         "domain": {"size": [size, size]},
-        "nodes": {"spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"centres": centres, "radii": [radius] * len(centres)},
         "time": {"end": 1.0},
         "shape_functions": {"kind": kind},

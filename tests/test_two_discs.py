@@ -21,7 +21,7 @@ KINDS: dict[str, dict[str, Any]] = {
 def discs(spacing: float, shape_functions: dict[str, Any], end: float) -> dict[str, Any]:
     return {
         "domain": {"size": [100.0, 60.0]},
-        "nodes": {"source": "lattice", "spacing": spacing},
+        "nodes": {"source": "triangular", "spacing": spacing},
         "shape_functions": shape_functions,
         "particles": {"source": "list", "centres": [[30.0, 30.0], [70.0, 30.0]], "radii": [20.0, 20.0]},
         "model": {"rigid_motion": False},

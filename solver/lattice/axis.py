@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Integers
 from ..shape import CONVERGED, NEWTON_STEPS, ShapeError
+from ..simd import LANES
 
 QUARTERS = (0.25, 0.75)  # of a cell, where its points are
 GHOSTS = 24  # places beyond both ends in tables by cell or node: packs may begin there
@@ -27,6 +28,8 @@ class Axis:
     length: float  # nm
     cells: int
     reach: int
+    gamma: float  # of the functions in units of `step`
+    tolerance: float
     N: Floats
     dN: Floats
 
@@ -43,7 +46,7 @@ class Axis:
     @property
     def points(self) -> Floats:
         """Positions (2, n) of both points of each cell, nm."""
-        return (np.arange(self.cells) + np.array(QUARTERS)[:, None]) * self.step
+        return np.asarray((np.arange(self.cells) + np.array(QUARTERS)[:, None]) * self.step)
 
     def sums(self, values: Floats) -> Floats:
         """sum_c N_i(x_c) values_c at the nodes i: (2, n + 1) from (2, n) or less."""
@@ -70,26 +73,34 @@ class Axis:
         rows[:, GHOSTS + self.cells + 1 :] = 0.0
         return rows
 
-    def at_nodes(self, gamma: float, tolerance: float) -> Floats:
+    def at(self, x: Floats) -> Floats:
+        """N_i(x) of all nodes i at places x (q,): (q, n + 1)."""
+        return functions(x, self.nodes, self.step, self.gamma, self.tolerance)[0]
+
+    def at_nodes(self) -> Floats:
         """Functions of the nodes i - reach + 1 ... i + reach - 1 at node i: (n + 1, 2 reach - 1)."""
-        N, _ = functions(self.nodes, self.nodes, self.step, gamma, tolerance)
+        N = self.at(self.nodes)
         i = np.arange(self.cells + 1)[:, None]
         return _taps(N, i - self.reach + 1 + np.arange(2 * self.reach - 1))
 
 
-def make_axis(length: float, spacing: float, gamma: float, tolerance: float) -> Axis:
-    """The axis whose nodes are nearest to `spacing` apart. Raises `ShapeError`."""
+def make_axis(length: float, spacing: float, gamma: float, tolerance: float, width: float | None = None) -> Axis:
+    """The axis whose nodes are nearest to `spacing` apart; width: h of beta = gamma / h^2 if not their distance.
+
+    Raises `ShapeError`.
+    """
     cells = max(1, round(length / spacing))
     step = length / cells
+    gamma = gamma if width is None else gamma * (step / width) ** 2
     reach = 1 + max(0, int(np.floor(search_range(gamma, tolerance) - QUARTERS[0])))
-    if reach > GHOSTS // 2:
+    if reach > LANES:
         raise ShapeError(f"gamma = {gamma:g} and tolerance = {tolerance:g}: functions reach {reach} nodes far")
     nodes = np.linspace(0.0, length, cells + 1)
     points = (np.arange(cells)[None, :] + np.array(QUARTERS)[:, None]) * step
     N, dN = functions(points.ravel(), nodes, step, gamma, tolerance)
     taps = np.tile(np.arange(cells), 2)[:, None] - reach + 1 + np.arange(2 * reach)
     tables = (_taps(table, taps).reshape(2, cells, -1) for table in (N, dN))
-    return Axis(length, cells, reach, *tables)
+    return Axis(length, cells, reach, gamma, tolerance, *tables)
 
 
 def search_range(gamma: float, tolerance: float) -> float:
@@ -128,7 +139,7 @@ def functions(points: Floats, nodes: Floats, h: float, gamma: float, tolerance: 
     return weight, slope
 
 
-def _taps(table: Floats, taps: Floats) -> Floats:
+def _taps(table: Floats, taps: Integers) -> Floats:
     """table[p, taps[p]], 0 where there is no such node."""
     inside = (taps >= 0) & (taps < table.shape[1])
     return np.where(inside, np.take_along_axis(table, np.clip(taps, 0, table.shape[1] - 1), axis=1), 0.0)

@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Numbers
+from ..arrays import Floats
 from ..neck import section
 from ..observe import distance
+from ..output import Fields
 from . import loops
-from .axis import Axis, functions
+from .axis import Axis
 from .scheme import LatticeScheme, LatticeState
 
 GAUSS = 8  # points per cell of the integral over the vacancy box
@@ -28,10 +29,9 @@ class LatticeObservables:
         g, output = scheme.lattice, scheme.case.output
         low, high = (np.asarray(corner, dtype=float) for corner in output.vacancy_box)
         self.box_volume = float(np.prod(high - low))
-        shape = scheme.case.shape_functions
         corners = (low[::-1], high[::-1]) if g.dim == 3 else (np.insert(low[::-1], 1, 0), np.insert(high[::-1], 1, 0))
         self.box = [
-            np.ones(1) if axis is None else integrals(axis, shape.gamma, shape.tolerance, corners[0][k], corners[1][k])
+            np.ones(1) if axis is None else integrals(axis, corners[0][k], corners[1][k])
             for k, axis in enumerate(g.axes)
         ]
 
@@ -75,14 +75,13 @@ class LatticeObservables:
         return {key: float(value) if isinstance(value, np.floating) else value for key, value in row.items()}
 
 
-def integrals(axis: Axis, gamma: float, tolerance: float, low: float, high: float) -> Floats:
+def integrals(axis: Axis, low: float, high: float) -> Floats:
     """int_low^high N_i dx of the axis' nodes i."""
     x, w = np.polynomial.legendre.leggauss(GAUSS)
     edges = np.unique(np.clip(np.concatenate([axis.nodes, [low, high]]), low, high))
     middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
     points = middle[:, None] + half[:, None] * x
-    N, _ = functions(points.ravel(), axis.nodes, axis.step, gamma, tolerance)
-    return np.asarray((half[:, None] * w).ravel() @ N)
+    return np.asarray((half[:, None] * w).ravel() @ axis.at(points.ravel()))
 
 
 def at_nodes(scheme: LatticeScheme, values: Floats, first: tuple[int, int, int]) -> Floats:
@@ -90,11 +89,10 @@ def at_nodes(scheme: LatticeScheme, values: Floats, first: tuple[int, int, int])
 
     Beside the array the coefficients count as 0.
     """
-    shape = scheme.case.shape_functions
     for k, axis in enumerate(scheme.lattice.axes):
         if axis is None:
             continue
-        table = scheme.at_nodes[k] if k in scheme.at_nodes else axis.at_nodes(shape.gamma, shape.tolerance)
+        table = scheme.at_nodes[k] if k in scheme.at_nodes else axis.at_nodes()
         scheme.at_nodes[k] = table
         count, reach = values.shape[k], axis.reach
         moved = np.moveaxis(values, k, 0)
@@ -115,8 +113,8 @@ def field_of(scheme: LatticeScheme, y: Floats, w: int) -> tuple[Floats, tuple[in
     return values[:, :, begin:end], (int(low[0]), int(low[1]), int(low[2]) + begin)
 
 
-def nodal(scheme: LatticeScheme, y: Floats) -> tuple[Floats, Numbers, Floats]:
-    """At this rank's nodes: rho; the particle with the largest eta where rho >= 1/2, else -1; sum eta^2."""
+def nodal(scheme: LatticeScheme, y: Floats) -> Fields:
+    """At this rank's nodes."""
     rho = at_nodes(scheme, *field_of(scheme, y, 0))
     largest, squares = np.full(rho.shape, -np.inf), np.zeros(rho.shape)
     particle = np.full(rho.shape, -1, dtype=np.int32)
@@ -131,7 +129,7 @@ def nodal(scheme: LatticeScheme, y: Floats) -> tuple[Floats, Numbers, Floats]:
         largest[here] = np.where(more, eta, largest[here])
         particle[here] = np.where(more, w - 1, particle[here])
         squares[here] += eta**2
-    return rho.ravel(), np.where(rho >= 0.5, particle, -1).astype(np.int32).ravel(), squares.ravel()
+    return Fields(rho.ravel(), squares.ravel(), np.where(rho >= 0.5, particle, -1).astype(np.int32).ravel())
 
 
 def neck(scheme: LatticeScheme, y: Floats) -> float:

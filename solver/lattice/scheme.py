@@ -10,7 +10,7 @@ from ..arrays import Floats, Integers
 from ..case import Case
 from ..energy import Coefficients
 from ..geometry import MeshError
-from ..partition import Collector, Halo, Ranks, Share
+from ..partition import Halo, Ranks, Share
 from ..simd import LANES
 from . import loops, windows
 from .axis import GHOSTS, Axis, make_axis
@@ -111,7 +111,7 @@ def axes_of(case: Case) -> tuple[Axis, Axis | None, Axis]:
     """Slow, middle and fast axis of the case's lattice. Raises `ShapeError`."""
     given, spacing = case.shape_functions, case.nodes.spacing
     assert spacing is not None  # narrows the type: the case was checked
-    axes = [make_axis(length, spacing, given.gamma, given.tolerance) for length in reversed(case.domain.size)]
+    axes = [make_axis(length, spacing, given.gamma, given.tolerance, given.width) for length in reversed(case.domain.size)]
     return (axes[0], None, axes[1]) if len(axes) == 2 else (axes[0], axes[1], axes[2])
 
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from .. import checkpoint
-from ..arrays import Floats, Numbers
+from ..arrays import Floats
 from ..case import Case
 from ..integrators import RK2, Chebyshev, Integrator, contact_time, paper_step
+from ..output import Fields
 from ..partition import Collector, Ranks, Share
 from . import guard, windows
 from .observe import LatticeObservables, nodal
@@ -90,9 +91,13 @@ class LatticeSetup:
         """What computes the history."""
         return LatticeObservables(system)
 
-    def nodal(self, system: LatticeScheme, state: LatticeState, u: Floats) -> tuple[Floats, Numbers, Floats]:
+    def fields(self, system: LatticeScheme, state: LatticeState, u: Floats, collector: Collector) -> Fields:
         """See `setup.Setup`."""
-        return nodal(system, u)
+        return Fields(*(collector.blocks(values) for values in nodal(system, u)))
+
+    def remarks(self) -> list[str]:
+        """See `setup.Setup`."""
+        return []
 
     def keep(
         self, directory: Path, system: LatticeScheme, state: LatticeState, collector: Collector, notes: dict[str, Any]

@@ -25,7 +25,8 @@ from .settings import Settings
 RANK = 450e6  # bytes: interpreter, libraries, compiled code and the compiler
 NODE = 1600.0  # bytes per node: fields, numbers of the integrator, mesh
 FACTORED = 900.0  # bytes per node of a square or cubic lattice, which has no mesh and no table of neighbours
-PAIR = {"lattice": 6.0, "triangular": 6.0, "gmsh": 40.0, "file": 75.0}  # bytes: on lattices few are kept; of gmsh more nodes are reckoned
+# bytes: on lattices few are kept; of gmsh more nodes are reckoned
+PAIR = {"lattice": 6.0, "triangular": 6.0, "gmsh": 40.0, "file": 75.0}
 SLOTS = 6  # order parameters per node that NODE has
 MANY_SLOTS = {2: 8, 3: 24}  # as many as shared slots get to: 6 in 2-D with 144 particles, 21 in 3-D with 150
 SLOT = 100.0  # bytes per node and further slot

@@ -106,17 +106,20 @@ def inlined(function: Function) -> Function:
     return cast(Function, numba.njit(forceinline=True, **OPTIONS)(function))
 
 
+LEAN: dict[str, Any] = {"_nrt": False}
+
+
 def lean(function: Function) -> Function:
     """`inlined` for functions that make no arrays, without numba's counting of references.
 
     It counts atomically each time an array is taken out of a named tuple: five times the work of a short inner loop.
     """
-    return cast(Function, numba.njit(forceinline=True, _nrt=False, **OPTIONS)(function))
+    return cast(Function, numba.njit(forceinline=True, **(OPTIONS | LEAN))(function))
 
 
 def lean_jit(function: Function) -> Function:
     """`jit` for functions that make no arrays, see `lean`."""
-    return cast(Function, numba.njit(_nrt=False, **OPTIONS)(function))
+    return cast(Function, numba.njit(**(OPTIONS | LEAN))(function))
 
 
 def exact(function: Function) -> Function:

@@ -52,6 +52,7 @@ class Observables:
             "solid_mass": sums[0],
             "free_energy": sums[1],
             "live_fraction": sums[2] / sums[3],
+            "evaluated_fraction": sums[2] / sums[3],
             "rho_min": -extremes[0],
             "rho_max": extremes[1],
             "particles": int((volumes > 1.0).sum()),

@@ -20,7 +20,7 @@ Tree = dict[str, Any]
 
 DISCS: Tree = {
     "domain": {"size": [46.0, 24.0]},
-    "nodes": {"spacing": 1.0},
+    "nodes": {"source": "triangular", "spacing": 1.0},
     "particles": {"centres": [[14.0, 12.0], [32.0, 12.0]], "radii": [9.0, 9.0]},
     "time": {"end": 5.0},
 }

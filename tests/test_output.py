@@ -4,7 +4,6 @@ import json
 import signal
 import stat
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
@@ -31,14 +30,12 @@ from launching import (
 
 from frit.solver import field, output
 from frit.solver.case import load_case, parse_case
-from frit.solver.geometry import Mesh
 from frit.solver.output import History, Snapshots
 from frit.solver.partition import Collector, Ranks
-from frit.solver.prepare import build_mesh, prepare
-from frit.solver.state import State
+from frit.solver.setup import MeshSetup, make_setup
 
 ROW = [
-    "time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "rho_min", "rho_max",
+    "time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "evaluated_fraction", "rho_min", "rho_max",
     "particles", "volumes", "evaluations", "wall_time",
 ]  # fmt: skip
 OF_A_PAIR = ["neck_length", "centre_distance"]
@@ -186,21 +183,27 @@ def test_snapshot_times_may_be_regular(triple: Path) -> None:
     assert snapshots(triple)["time"].tolist() == [0.0, 0.0006, 2 * 0.0006, 3 * 0.0006]
 
 
-def test_two_ranks_write_the_snapshots_of_one(tmp_path: Path, pair: Path) -> None:
-    together = solve(PAIR, tmp_path / "run", ranks=2, script=SMALL_CHUNKS)
+@pytest.mark.parametrize("source", ["lattice", "triangular"])
+def test_two_ranks_write_the_snapshots_of_one(tmp_path: Path, pair: Path, source: str) -> None:
+    case = PAIR | {"nodes": {"source": source, "spacing": 1.0}}
+    alone = pair if source == "lattice" else solve(case, tmp_path / "alone")
+    together = solve(case, tmp_path / "run", ranks=2, script=SMALL_CHUNKS)
     chunks = zarr.open_array(together / "snapshots.zarr", path="rho", mode="r")
     assert chunks.chunks == (1, 37)
     assert chunks.shape[1] % 37 != 0
-    assert different(pair, together, 1e-10) == {}  # see test_ranks.py
+    assert different(alone, together, 1e-10) == {}  # see test_ranks.py
 
 
 @pytest.fixture
-def writer(tmp_path: Path, ranks: Ranks) -> tuple[Snapshots, State]:
-    """Snapshots of the pair, made by this process, and the state of time 0."""
+def writer(tmp_path: Path, ranks: Ranks) -> tuple[Snapshots, output.Fields]:
+    """Snapshots of the pair, made by this process, and the fields at time 0."""
     case = parse_case(PAIR)
-    mesh: Mesh = build_mesh(case, ranks)
-    scheme, state = prepare(case, mesh, ranks)
-    return Snapshots(tmp_path, case, mesh, Collector(scheme.d.share, 100), fresh=True), state
+    setup = make_setup(case, ranks)
+    scheme, state, _ = setup.start()
+    collector = Collector(setup.share(scheme), 100)
+    fields = setup.fields(scheme, state, scheme.at(state, scheme.vector(state)), collector)
+    assert fields is not None
+    return Snapshots(tmp_path, case, setup.positions, collector, fresh=True), fields
 
 
 def seen(path: Path) -> set[int]:
@@ -210,10 +213,10 @@ def seen(path: Path) -> set[int]:
 
 @pytest.mark.parametrize("moment", ["_publish", "consolidate"])
 def test_a_snapshot_is_invisible_until_it_is_complete(
-    writer: tuple[Snapshots, State], monkeypatch: pytest.MonkeyPatch, moment: str
+    writer: tuple[Snapshots, output.Fields], monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     """After the chunks are written, and after the arrays have grown, a reader still sees what was there before."""
-    snapshot, state = writer
+    snapshot, fields = writer
     owner: Any = Snapshots if moment == "_publish" else output
     real: Callable[..., None] = getattr(owner, moment)
     before = []
@@ -224,45 +227,65 @@ def test_a_snapshot_is_invisible_until_it_is_complete(
 
     monkeypatch.setattr(owner, moment, look)
     for number in range(3):
-        snapshot.write(number, 0.5 * number, state, state.u)
+        snapshot.write(number, 0.5 * number, fields)
         assert seen(snapshot.path) == {number + 1}
     assert before == [{0}, {1}, {2}]
     found = zarr.open_group(snapshot.path, mode="r")
     assert np.asarray(found["time"]).tolist() == [0.0, 0.5, 1.0]
-    exact = field.at(snapshot.case, snapshot.mesh, snapshot.mesh.nodes, state.u)
-    np.testing.assert_allclose(np.asarray(found["rho"])[2], exact[:, 0], rtol=0, atol=1e-13)
-    assert np.abs(exact[:, 0] - state.rho).max() > 0.01  # the field, not the coefficients
+    for name, values in fields._asdict().items():
+        np.testing.assert_array_equal(np.asarray(found[name])[2], values)
+
+
+@pytest.mark.parametrize("source", ["lattice", "triangular"])
+def test_a_snapshot_holds_the_field_not_the_coefficients(ranks: Ranks, source: str) -> None:
+    case = parse_case(PAIR | {"nodes": {"source": source, "spacing": 1.0}})
+    setup = make_setup(case, ranks)
+    scheme, state, _ = setup.start()
+    fields = setup.fields(scheme, state, scheme.at(state, scheme.vector(state)), Collector(setup.share(scheme), 100))
+    assert fields is not None
+    if isinstance(setup, MeshSetup):
+        coefficients = state.rho
+        exact = field.at(case, setup.mesh, setup.mesh.nodes, state.u)[:, 0]
+    else:
+        coefficients = scheme.lattice.values(state.y).ravel()
+        x, y = (axis.at(axis.nodes) for axis in (scheme.lattice.axes[2], scheme.lattice.axes[0]))
+        exact = (y @ scheme.lattice.values(state.y)[:, 0] @ x.T).ravel()
+    np.testing.assert_allclose(fields.rho, exact, rtol=0, atol=1e-13)
+    assert np.abs(exact - coefficients).max() > 0.01
 
 
 @pytest.mark.parametrize("moment", ["_publish", "consolidate"])
 def test_a_snapshot_cut_short_is_written_again(
-    writer: tuple[Snapshots, State], monkeypatch: pytest.MonkeyPatch, moment: str
+    writer: tuple[Snapshots, output.Fields], monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     """As a resumed run does. Cut short just before it becomes visible it is stored, but nobody sees it yet."""
 
     def cut(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    snapshot, state = writer
+    snapshot, fields = writer
     with monkeypatch.context() as patch:
         patch.setattr(Snapshots if moment == "_publish" else output, moment, cut)
         with pytest.raises(KeyboardInterrupt):
-            snapshot.write(0, 0.0, state, state.u)
+            snapshot.write(0, 0.0, fields)
     assert seen(snapshot.path) == {0}
-    snapshot.write(0, 0.0, state, state.u)
-    snapshot.write(0, 0.0, state, state.u)
+    snapshot.write(0, 0.0, fields)
+    snapshot.write(0, 0.0, fields)
     assert seen(snapshot.path) == {1}
 
 
-def test_a_snapshot_out_of_turn_gives_way_to_those_that_were_asked_for(writer: tuple[Snapshots, State]) -> None:
+def test_a_snapshot_out_of_turn_gives_way_to_those_that_were_asked_for(
+    writer: tuple[Snapshots, output.Fields],
+) -> None:
     """That of a failure comes behind those before it; a resumed run, which gets farther, writes over it."""
-    snapshot, state = writer
-    snapshot.write(0, 0.0, state, state.u)
+    snapshot, fields = writer
+    snapshot.write(0, 0.0, fields)
     for time in (0.003, 0.0034):
-        snapshot.keep(replace(state, time=time))
+        assert snapshot.next(time) == 1
+        snapshot.write(snapshot.next(time), time, fields)
         group = zarr.open_group(snapshot.path, mode="r")
         assert np.asarray(group["time"]).tolist() == [0.0, time]
-    snapshot.write(1, 0.0035, state, 0.5 * state.u)
+    snapshot.write(1, 0.0035, fields._replace(rho=0.5 * fields.rho))
     group = zarr.open_group(snapshot.path, mode="r")
     assert np.asarray(group["time"]).tolist() == [0.0, 0.0035]
     np.testing.assert_allclose(np.asarray(group["rho"])[1], 0.5 * np.asarray(group["rho"])[0], rtol=1e-13)
@@ -273,9 +296,9 @@ def test_values_at_half_belong_to_the_particle() -> None:
     u = np.zeros((3, 8))
     u[:, :3] = [[0.5, 0.2, 0.3], [0.49, 0.2, 0.3], [0.9, 0.8, 0.1]]
     owner = np.array([[4, 7], [4, 7], [7, 4]], dtype=np.int32)
-    particle, eta_squared = output.owners(u, owner)
-    assert particle.tolist() == [7, -1, 7]
-    assert relative(np.array([0.13, 0.13, 0.65]), eta_squared) < 1e-15
+    fields = output.fields_of(u, owner)
+    assert fields.particle.tolist() == [7, -1, 7]
+    assert relative(np.array([0.13, 0.13, 0.65]), fields.eta_squared) < 1e-15
 
 
 # --- the history's file ---------------------------------------------------------------------------------

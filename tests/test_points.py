@@ -179,7 +179,7 @@ def test_keys_of_their_own_count_only_where_they_say_something() -> None:
         "time": {"end": 10.0},
     }
     told: list[dict[str, Any]] = [
-        {"points": {"source": "triangular"}}, {"points": {"source": "cells"}}, {"points": {"pitch": 0.5}},
+        {"points": {"source": "lattice"}}, {"points": {"source": "cells"}}, {"points": {"pitch": 0.5}},
         {"shape_functions": {"width": 1.0}},
     ]  # fmt: skip
     plain = parse_case(discs).identity()
@@ -190,7 +190,8 @@ def test_keys_of_their_own_count_only_where_they_say_something() -> None:
 @pytest.mark.parametrize(
     ("tables", "revision"),
     [
-        ({}, 1),
+        ({}, 4),
+        ({"nodes": {"source": "triangular", "spacing": 1.0}}, 1),
         ({"nodes": {"source": "gmsh", "spacing": 1.0}}, 2),
         ({"nodes": {"source": "gmsh", "spacing": 1.0}, "shape_functions": {"kind": "linear"}}, 1),
     ],

@@ -1,8 +1,8 @@
 """The shape functions of one axis of a lattice, and their sums over its points.
 
-With a box as search range, local maximum-entropy functions on a square or cubic lattice are products: of
-exp(-gamma (x - x_i)^2 / h^2 + lambda (x - x_i)) / Z along each axis, at walls too. Every cell has two material points, at
-1/4 and at 3/4 of its diagonal, so that an axis knows two sets of points, one at each quarter of its cells.
+With a box as search range, local maximum-entropy functions on a square or cubic lattice are products, at walls too: of
+exp(-gamma (x - x_i)^2 / h^2 + lambda (x - x_i)) / Z along each axis. Every cell has two material points, at 1/4 and at
+3/4 of its diagonal, so that an axis knows two sets of points, one at each quarter of its cells.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Axis:
     gamma: float  # of the functions in units of `step`
     tolerance: float
     N: Floats
-    dN: Floats
+    dN: Floats  # noqa: N815  (the derivative of N)
 
     @property
     def step(self) -> float:

@@ -5,6 +5,7 @@ import numpy as np
 from ..arrays import Floats
 from ..run import HIGHEST, HIGHEST_AT_WALL, LOWEST, PRESSED, REFRESH, RunError, check, piled_up, renew
 from . import loops, windows
+from .axis import GHOSTS
 from .scheme import LatticeScheme, LatticeState
 from .start import fitting_boxes, move
 
@@ -31,7 +32,8 @@ def _(scheme: LatticeScheme, state: LatticeState, y: Floats) -> None:
     """Raise RunError where rho at a point, or an eta, is none or out of range. Collective."""
     g, found = scheme.lattice, extremes(scheme)
     etas = y[scheme.rho :]
-    bad = np.array([max(-found[0], -etas.min(initial=0.0)), found[1], max(found[2], 0.0), etas.max(initial=0.0), found[3]])
+    least = max(-found[0], -etas.min(initial=0.0))
+    bad = np.array([least, found[1], max(found[2], 0.0), etas.max(initial=0.0), found[3]])
     bad = np.where(np.isnan(bad), np.inf, bad)
     g.ranks.max(bad)
     if bad[0] <= -LOWEST and bad[1] <= HIGHEST and bad[2] <= HIGHEST_AT_WALL and bad[3] <= HIGHEST and bad[4] == 0.0:
@@ -55,7 +57,8 @@ def _(scheme: LatticeScheme, state: LatticeState) -> str | None:
     most = scheme.ranks.max(np.array([found[2]]))
     if not most[0] > HIGHEST:
         return None
-    return f"at t = {state.time:.6g}, step {state.step}{place_of(scheme, float(most[0]), found)}: rho = {most[0]:.4g} at a wall: {PRESSED}"
+    place = place_of(scheme, float(most[0]), found)
+    return f"at t = {state.time:.6g}, step {state.step}{place}: rho = {most[0]:.4g} at a wall: {PRESSED}"
 
 
 def extremes(scheme: LatticeScheme) -> Floats:
@@ -72,11 +75,12 @@ def place_of(scheme: LatticeScheme, value: float, found: Floats) -> str:
     g = scheme.lattice
     said = None
     if value in (found[1], found[2]):
-        rows, cells = scheme.points.rho[:, loops.GHOSTS : loops.GHOSTS + g.axes[2].cells], g.axes[1]
-        row, c = np.unravel_index(int((rows == value).argmax()), rows.shape)
-        middle = 1 if cells is None else cells.cells
-        p, k, j = np.unravel_index(int(row), (2, len(g.layers), middle))
-        at = [g.axes[2].points[p, c], *([] if cells is None else [cells.points[p, j]]), g.axes[0].points[p, g.layers[k]]]
+        slow, middle, fast = g.axes
+        rows = scheme.points.rho[:, GHOSTS : GHOSTS + fast.cells]
+        row, c = divmod(int((rows == value).argmax()), fast.cells)
+        p, k, j = (int(i) for i in np.unravel_index(row, (2, len(g.layers), 1 if middle is None else middle.cells)))
+        between = [] if middle is None else [middle.points[p, j]]
+        at = [fast.points[p, c], *between, slow.points[p, g.layers[k]]]
         said = f", ({', '.join(f'{x:.3f}' for x in at)}) nm"
     texts: list[str] = [text[0] for text in g.ranks.everyones(np.array([said], dtype=object)) if text[0] is not None]
     return texts[0] if texts else ""

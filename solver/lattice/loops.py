@@ -15,7 +15,7 @@ from ..contacts import FAR, Contacts, add_contact
 from ..energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
 from ..jit import lean, lean_jit
 from ..simd import LANES, Pack, flush_denormals, load, positive, restore_denormals, splat, store, total
-from .axis import GHOSTS
+from .axis import GHOSTS as GHOSTS
 from .windows import Layout
 
 PAD = 24  # places on both sides of a row of work space
@@ -226,14 +226,20 @@ def all_at(Y: Floats, q: int, c: int, p: int, T: Tables) -> tuple[Pack, Pack, Pa
 
 
 @lean
+def add_to(array: Floats, row: int, column: int, more: Pack) -> None:
+    """Add to a pack in place."""
+    store(array, row, column, load(array, row, column) + more)
+
+
+@lean
 def cells_of(w: int, k: int, j: int, L: Layout) -> tuple[int, int]:
     """Packs of the row j of layer k in which a cell has a corner in the window, counted as the window's places."""
-    begin, end = np.int64(1 << 30), np.int64(0)
+    begin, end = 1 << 30, 0
     nm = L.size[w, 1]
     for s in range(max(0, k - L.low[w, 0]), min(L.size[w, 0], k - L.low[w, 0] + 2)):
         for m in range(max(0, j - L.low[w, 1]), min(nm, j - L.low[w, 1] + 2)):
             row = L.row[w] + s * nm + m
-            begin, end = min(begin, L.begin[row]), max(end, L.end[row])
+            begin, end = min(begin, int(L.begin[row])), max(end, int(L.end[row]))
     return max(begin - 1, 0) // LANES, -(-end // LANES)
 
 
@@ -248,10 +254,10 @@ def back(
     for q in (b - 2, b - 1, e, e + 1):
         for f in range(4):
             store(F, f, PAD + LANES * q, splat(0.0))
-    begin, end = np.int64(e), np.int64(b)
+    begin, end = e, b
     for r in range(first + t0, first + t1):
         if spans[r, 1] > spans[r, 0]:
-            begin, end = min(begin, spans[r, 0]), max(end, spans[r, 1])
+            begin, end = min(begin, int(spans[r, 0])), max(end, int(spans[r, 1]))
     for q in range(max(begin, b - 1), min(end, e + 1)):
         source, middle, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, T)
         if t1 - t0 == SIX:
@@ -410,8 +416,8 @@ def add_sums(w: int, k: int, y: Floats, L: Layout, T: Tables, room: Room) -> Non
                 overlap = load(room.sums, (2 + p) * count + j, at)
                 store(room.sums, (2 + p) * count + j, at, overlap + 2.0 * inside * S1)
                 store(room.sums, p * count + j, at, S1 + inside)
-                store(room.sums, (4 + p) * count + j, at, load(room.sums, (4 + p) * count + j, at) + eta * eta)
-                store(room.sums, (6 + p) * count + j, at, load(room.sums, (6 + p) * count + j, at) + eta * eta * eta)
+                add_to(room.sums, (4 + p) * count + j, at, eta * eta)
+                add_to(room.sums, (6 + p) * count + j, at, eta * eta * eta)
 
 
 @lean_jit
@@ -600,15 +606,15 @@ def change(
                     swept = eta * eta if huang else eta
                     square = w_p * eta * eta
                     fast = fast + square * v_x
-                    store(room.swept, p * count + j, at, load(room.swept, p * count + j, at) + swept * v_x)
+                    add_to(room.swept, p * count + j, at, swept * v_x)
                     if plane:
                         slow = slow + square * v_y
-                        store(room.swept, (4 + p) * count + j, at, load(room.swept, (4 + p) * count + j, at) + swept * v_y)
+                        add_to(room.swept, (4 + p) * count + j, at, swept * v_y)
                     else:
                         middle = middle + square * v_y
                         slow = slow + square * v_z
-                        store(room.swept, (2 + p) * count + j, at, load(room.swept, (2 + p) * count + j, at) + swept * v_y)
-                        store(room.swept, (4 + p) * count + j, at, load(room.swept, (4 + p) * count + j, at) + swept * v_z)
+                        add_to(room.swept, (2 + p) * count + j, at, swept * v_y)
+                        add_to(room.swept, (4 + p) * count + j, at, swept * v_z)
                 place = PAD + LANES * q
                 store(room.F, 0, place, (-m.L * w_p) * df_deta(eta, rho, S2, m))
                 store(room.F, 1, place, fast)
@@ -641,7 +647,9 @@ def divide(rate: Floats, inverse_mass: Floats, L: Layout, first: int, last: int)
 
 
 @lean_jit
-def add_moments(moments: Floats, y: Floats, L: Layout, slow: Floats, middle: Floats, fast: Floats, first: int, last: int) -> None:
+def add_moments(
+    moments: Floats, y: Floats, L: Layout, slow: Floats, middle: Floats, fast: Floats, first: int, last: int
+) -> None:
     """moments[a] += sum_b (m_b, q_b) eta_b over the planes first ... last - 1: V_a and int r eta_a, exactly.
 
     slow, middle, fast (2, 2, n): the sums over an axis' points of N and of x N at its nodes, the weights in `slow`.
@@ -694,7 +702,7 @@ def energy(
                         eta, x, v, z = all_at(room.Y, q, c, p, T)
                         at, square = GHOSTS + c, x * x + v * v + z * z
                         for f, more in ((0, square), (4, eta * eta), (6, eta * eta * eta)):
-                            store(room.sums, (f + p) * count + j, at, load(room.sums, (f + p) * count + j, at) + more)
+                            add_to(room.sums, (f + p) * count + j, at, more)
                         steep = load(room.sums, (2 + p) * count + j, at) + positive(square - eps_eta * eps_eta)
                         store(room.sums, (2 + p) * count + j, at, steep)
         along_slow(True, room.Z, room.spans, y, 0, k, L, T)
@@ -742,7 +750,7 @@ def step_error(
     sums: Floats, new: Floats, old: Floats, rate_1: Floats, rate_0: Floats, dt: float, tolerance: float,
     inverse_mass: Floats, L: Layout, first: int, last: int,
 ) -> None:
-    """sums = sum_a m_a sum_fields (e / (tolerance (1 + |u|)))^2 and sum_a m_a over the nodes on planes first ... last - 1;
+    """sums = sum_a m_a sum_fields (e / (tolerance (1 + |u|)))^2, sum_a m_a over the nodes on planes first ... last - 1;
 
     e = 0.8 (y_n - y_{n+1}) + 0.4 dt (F_n + F_{n+1}).
     """
@@ -773,7 +781,7 @@ def step_error(
 
 @lean_jit
 def extremes(found: Floats, values: Floats, layers: int, count: int, cells: int, edges: Floats) -> None:
-    """found = least value, largest, largest next to a wall, of `Points.rho`, and 1 where one is not a number.
+    """found = least value, largest, largest next to a wall of `Points.rho`, and 1 where one is not a number.
 
     edges (2,): whether the rank's first and last layer are at a wall; count: rows of cells in a layer.
     """

@@ -14,7 +14,7 @@ from .scheme import LatticeScheme, LatticeState
 
 GAUSS = 8  # points per cell of the integral over the vacancy box
 
-# A square cut into two triangles, a cube into six tetrahedra along its diagonal: corners as (slow, middle, fast) offsets
+# A square cut into two triangles, a cube into six tetrahedra along its diagonal: corners as offsets (slow, middle, fast)
 TRIANGLES = (((0, 0, 0), (0, 0, 1), (1, 0, 1)), ((0, 0, 0), (1, 0, 1), (1, 0, 0)))
 TETRAHEDRA = tuple(
     ((0, 0, 0), tuple(int(i == a) for i in range(3)), tuple(int(i != c) for i in range(3)), (1, 1, 1))
@@ -35,7 +35,9 @@ class LatticeObservables:
             for k, axis in enumerate(g.axes)
         ]
 
-    def row(self, scheme: LatticeScheme, state: LatticeState, y: Floats, time: float, wall_time: float) -> dict[str, Any]:
+    def row(
+        self, scheme: LatticeScheme, state: LatticeState, y: Floats, time: float, wall_time: float
+    ) -> dict[str, Any]:
         """One history row, named as in the run directory's history.jsonl."""
         g, m, switch, count = scheme.lattice, scheme.lattice.coefficients, scheme.case.activation, scheme.particles
         held = slice(g.owned.start - g.planes.start, g.owned.stop - g.planes.start)

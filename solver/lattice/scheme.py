@@ -1,4 +1,4 @@
-"""The rates of change of all fields on a square or cubic lattice: the algorithm of `frit.solver.scheme`, axis by axis."""
+"""The rates of change of all fields on a square or cubic lattice: the algorithm of `..scheme`, axis by axis."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -111,7 +111,8 @@ def axes_of(case: Case) -> tuple[Axis, Axis | None, Axis]:
     """Slow, middle and fast axis of the case's lattice. Raises `ShapeError`."""
     given, spacing = case.shape_functions, case.nodes.spacing
     assert spacing is not None  # narrows the type: the case was checked
-    axes = [make_axis(length, spacing, given.gamma, given.tolerance, given.width) for length in reversed(case.domain.size)]
+    shape = given.gamma, given.tolerance, given.width
+    axes = [make_axis(length, spacing, *shape) for length in reversed(case.domain.size)]
     return (axes[0], None, axes[1]) if len(axes) == 2 else (axes[0], axes[1], axes[2])
 
 
@@ -144,9 +145,9 @@ def make_lattice(case: Case, ranks: Ranks, work: Floats | None = None) -> Lattic
         fast.N[:, fast.cells // 2].copy(), fast.dN[:, fast.cells // 2].copy(),
         np.pad(centred(fast), ((0, 0), (GHOSTS, GHOSTS))), centred(middle), centred(slow), weight,
     )  # fmt: skip
+    alone = np.array([[[1.0], [1.0]], [[0.0], [0.0]]])
     sums = [
-        np.array([[[1.0], [1.0]], [[0.0], [0.0]]]) if axis is None else np.stack([axis.sums(np.ones((2, 1))), axis.sums(centred(axis))])
-        for axis in axes
+        alone if axis is None else np.stack([axis.sums(np.ones((2, 1))), axis.sums(centred(axis))]) for axis in axes
     ]
     sums[0] *= weight
     found = Lattice(
@@ -205,7 +206,8 @@ class LatticeScheme:
         if not hasattr(self, "points"):
             self.points = Points(*(np.zeros((2 * len(g.layers) * cells, P)) for _ in range(3)))
             self.W = np.zeros((1, self.rho))
-            self.halo_W = g.halo(Layout(*(array[:1] if k < 4 else array for k, array in enumerate(self.layout)))._replace(offset=self.layout.offset[:2]))  # type: ignore[arg-type]
+            low, size = self.layout.low[:1], self.layout.size[:1]
+            self.halo_W = g.halo(self.layout._replace(offset=self.layout.offset[:2], low=low, size=size))
         self.halo = g.halo(self.layout)
 
     @property
@@ -288,8 +290,9 @@ class LatticeScheme:
         """See `system.System`."""
         sums, owned = np.empty(2), self.lattice.owned
         loops.step_error(
-            sums, new, old, rate_1, rate_0, dt, tolerance, self.lattice.inverse_mass, self.layout, owned.start, owned.stop
-        )
+            sums, new, old, rate_1, rate_0, dt, tolerance, self.lattice.inverse_mass, self.layout,
+            owned.start, owned.stop,
+        )  # fmt: skip
         return sums
 
     def scramble(self, direction: Floats, rate: Floats) -> None:

@@ -129,7 +129,8 @@ class LatticeSetup:
 
     def fingerprint(self) -> str:
         """Of what the fields stand on."""
-        return "lattice " + " x ".join(f"{axis.cells} of {axis.length!r} reach {axis.reach}" for axis in self.axes if axis)
+        axes = [f"{axis.cells} of {axis.length!r} reach {axis.reach}" for axis in self.axes if axis is not None]
+        return f"lattice {' x '.join(axes)}"
 
 
 BOXES = ("low", "size", "row", "begin", "end")

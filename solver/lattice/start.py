@@ -46,9 +46,9 @@ def initial_fields(case: Case, lattice: Lattice, layout: Layout) -> Floats:
     beyond = radii + 0.5 * xi * np.log(1.0 / TAIL)
     for a, centre in enumerate(np.asarray(case.particles.centres)):
         at = [centre[-1], centre[1] if lattice.dim == 3 else 0.0, centre[0]]
-        ranges = []
+        ranges: list[Integers] = []
         for k in range(3):
-            near = np.flatnonzero(np.abs(axes[k] - at[k]) <= beyond[a]) if lattice.dim == 3 or k != 1 else np.zeros(1, dtype=int)
+            near = np.flatnonzero(np.abs(axes[k] - at[k]) <= beyond[a])
             ranges.append(near[(near >= held.start) & (near < held.stop)] if k == 0 else near)
         if any(near.size == 0 for near in ranges):
             continue
@@ -61,8 +61,8 @@ def initial_fields(case: Case, lattice: Lattice, layout: Layout) -> Floats:
             continue
         window = y[layout.offset[w] : layout.offset[w + 1]].reshape(size)
         inside = [(near >= layout.low[w, k]) & (near < layout.low[w, k] + size[k]) for k, near in enumerate(ranges)]
-        chosen = np.ix_(*(near[keep] - layout.low[w, k] for k, (near, keep) in enumerate(zip(ranges, inside, strict=True))))
-        window[chosen] = eta[np.ix_(*inside)]
+        kept = [near[keep] - layout.low[w, k] for k, (near, keep) in enumerate(zip(ranges, inside, strict=True))]
+        window[np.ix_(*kept)] = eta[np.ix_(*inside)]
         if few:
             window[window < cut] = 0.0
     np.minimum(rho, 1.0, out=rho)
@@ -85,7 +85,8 @@ def fitting_boxes(scheme: LatticeScheme, y: Floats, least: float) -> Boxes:
     lows: list[Integers] = []
     for a in range(len(boxes.low)):
         rows, shape = slice(boxes.row[a], boxes.row[a + 1]), tuple(boxes.size[a, :2])
-        b, e, low = windows.widened(begin[rows].reshape(shape), end[rows].reshape(shape), boxes.low[a, :2], g.nodes, MARGIN)
+        found = begin[rows].reshape(shape), end[rows].reshape(shape)
+        b, e, low = windows.widened(*found, boxes.low[a, :2], g.nodes, MARGIN)
         begins.append(b)
         ends.append(e)
         lows.append(low)

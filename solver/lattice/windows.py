@@ -45,7 +45,7 @@ class Boxes:
 
 
 def boxes_of(begin: list[Integers], end: list[Integers], low: list[Integers], reach: int) -> Boxes:
-    """Boxes around intervals of nodes: begin, end (slow, middle) in nodes of the lattice, low (2,) of their first row."""
+    """Boxes around intervals: begin, end (slow, middle) in nodes of the lattice, low (2,) of their first row."""
     lows, sizes, begins, ends = [], [], [], []
     for b, e, corner in zip(begin, end, low, strict=True):
         there = e > b
@@ -64,8 +64,13 @@ def boxes_of(begin: list[Integers], end: list[Integers], low: list[Integers], re
         ends.append(np.where(there, e - first, 0).ravel())
     size = np.array(sizes, dtype=np.int64).reshape(-1, 3)
     row = np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])])
-    joined = (np.concatenate([np.empty(0, dtype=np.int32), *some]).astype(np.int32) for some in (begins, ends))
-    return Boxes(np.array(lows, dtype=np.int64).reshape(-1, 3), size, row, *joined)
+    low_ = np.array(lows, dtype=np.int64).reshape(-1, 3)
+    return Boxes(low_, size, row, joined(begins), joined(ends))
+
+
+def joined(arrays: list[Integers]) -> Numbers:
+    """One after another, as short numbers."""
+    return np.concatenate([np.empty(0, dtype=np.int32), *arrays]).astype(np.int32)
 
 
 def lay_out(boxes: Boxes, nodes: tuple[int, int, int], reach: int, planes: tuple[int, int], layers: range) -> Layout:
@@ -91,11 +96,11 @@ def lay_out(boxes: Boxes, nodes: tuple[int, int, int], reach: int, planes: tuple
     low = np.array(lows, dtype=np.int64)
     offset = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
     row = np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])])[:-1]
-    seen = [[w for w in range(1, len(low)) if size[w, 0] and low[w, 0] - 1 <= k < low[w, 0] + size[w, 0]] for k in layers]
+    tops = low[:, 0] + size[:, 0]
+    there = np.arange(1, len(low))[size[1:, 0] > 0]
+    seen = [there[(low[there, 0] - 1 <= k) & (k < tops[there])] for k in layers]
     counts = np.concatenate([[0], np.cumsum([len(some) for some in seen])])
-    window = np.array([w for some in seen for w in some], dtype=np.int32)
-    flat = (np.concatenate(some).astype(np.int32) for some in (begins, ends))
-    return Layout(offset, low, size, row, *flat, counts, window)
+    return Layout(offset, low, size, row, joined(begins), joined(ends), counts, joined(seen))
 
 
 @jit
@@ -121,8 +126,10 @@ def carry(new: Floats, to: Layout, old: Floats, of: Layout) -> None:
 
 
 @jit
-def intervals(begin: Numbers, end: Numbers, y: Floats, layout: Layout, boxes_low: Integers, boxes_size: Integers,
-              boxes_row: Integers, least: float, first: int, last: int) -> None:  # fmt: skip
+def intervals(
+    begin: Numbers, end: Numbers, y: Floats, layout: Layout,
+    boxes_low: Integers, boxes_size: Integers, boxes_row: Integers, least: float, first: int, last: int,
+) -> None:
     """Of each row of the boxes on planes first ... last - 1: from the first to the last node with |eta| >= least.
 
     In nodes of the lattice; rows that have none keep what they hold.
@@ -142,9 +149,9 @@ def intervals(begin: Numbers, end: Numbers, y: Floats, layout: Layout, boxes_low
                         end[row] = max(end[row], layout.low[w, 2] + i + 1)
 
 
-def widened(begin: Integers, end: Integers, low: Integers, nodes: tuple[int, int, int], margin: int) -> tuple[
-    Integers, Integers, Integers
-]:  # fmt: skip
+def widened(
+    begin: Integers, end: Integers, low: Integers, nodes: tuple[int, int, int], margin: int
+) -> tuple[Integers, Integers, Integers]:
     """Intervals (slow, middle) with `margin` more nodes along every axis, and the row (2,) that they begin at."""
     grow = [min(margin, n - 1) for n in nodes]
     room = [(grow[0], grow[0]), (grow[1], grow[1])]
@@ -154,12 +161,12 @@ def widened(begin: Integers, end: Integers, low: Integers, nodes: tuple[int, int
         for shift in range(1, reach + 1):
             for ahead, behind in ((slice(shift, None), slice(None, -shift)), (slice(None, -shift), slice(shift, None))):
                 here = (ahead, slice(None)) if axis == 0 else (slice(None), ahead)
-                there = (behind, slice(None)) if axis == 0 else (slice(None), behind)
-                b[here] = np.minimum(b[here], source[0][there])
-                e[here] = np.maximum(e[here], source[1][there])
+                beside = (behind, slice(None)) if axis == 0 else (slice(None), behind)
+                b[here] = np.minimum(b[here], source[0][beside])
+                e[here] = np.maximum(e[here], source[1][beside])
     corner = low - np.array(grow[:2])
-    inside = [slice(max(0, -int(corner[k])), max(0, min(b.shape[k], nodes[k] - int(corner[k])))) for k in range(2)]
-    b, e = b[inside[0], inside[1]], e[inside[0], inside[1]]
+    rows = [slice(max(0, -int(corner[k])), max(0, min(b.shape[k], nodes[k] - int(corner[k])))) for k in range(2)]
+    b, e = b[rows[0], rows[1]], e[rows[0], rows[1]]
     there = e > b
     b = np.where(there, np.maximum(b - grow[2], 0), NONE)
     e = np.where(there, np.minimum(e + grow[2], nodes[2]), 0)
@@ -188,10 +195,9 @@ def rim(y: Floats, layout: Layout, nodes: Integers, margin: int) -> float:
                         if place < 0 or place >= nodes[axis]:
                             continue  # a wall
                         if z < 0 or z >= ns or x < 0 or x >= nm:
-                            if axis == 0 and (place < layout.low[0, 0] or place >= layout.low[0, 0] + layout.size[0, 0]):
-                                continue  # another rank's
-                            inner_begin, inner_end = end, begin
-                            continue
+                            if axis == 1 or layout.low[0, 0] <= place < layout.low[0, 0] + layout.size[0, 0]:
+                                inner_begin, inner_end = end, begin
+                            continue  # else it is another rank's to say
                         other = layout.row[w] + z * nm + x
                         inner_begin = max(inner_begin, layout.begin[other])
                         inner_end = min(inner_end, layout.end[other])

@@ -29,6 +29,7 @@ import numba
 COMPILED = (
     "simd.py", "energy.py", "kernels.py", "blocks.py", "block_kernels.py", "neighbours.py", "shape.py", "clip.py",
     "unknowns.py", "vectors.py", "contacts.py", "elimination.py", "rigid.py", "box.py", "slots.py", "dem.py", "jit.py",
+    "sampling.py",
 )
 
 # Reassociation, contraction and reciprocals, but NaN and infinity keep their meaning: a bad state must be seen.

@@ -29,7 +29,7 @@ import numba
 COMPILED = (
     "simd.py", "energy.py", "kernels.py", "blocks.py", "block_kernels.py", "neighbours.py", "shape.py", "clip.py",
     "unknowns.py", "vectors.py", "contacts.py", "elimination.py", "rigid.py", "box.py", "slots.py", "dem.py", "jit.py",
-    "lattice/windows.py", "lattice/loops.py",
+    "sampling.py", "lattice/windows.py", "lattice/loops.py",
 )
 
 # Reassociation, contraction and reciprocals, but NaN and infinity keep their meaning: a bad state must be seen.

@@ -2,7 +2,7 @@
 
 Tiny cases are run to their end in a folder that is thrown away. Together they reach every compiled function with
 every kind of argument: two and three dimensions, both shape functions, both integrators, with and without rigid
-motion, one particle and several, a whole run and a resumed one.
+motion, one particle and several, a lattice and free nodes, a whole run and a resumed one.
 """
 
 import json
@@ -13,6 +13,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from .geometry import lattice
 from .jit import cache_folder
 
 Tree = dict[str, Any]
@@ -65,18 +68,29 @@ CASES: list[Tree] = [
 ]
 
 
+def on_free_nodes(tree: Tree, path: Path) -> Tree:
+    """The case on a mesh file, made here, of the nodes of its lattice."""
+    import meshio
+
+    mesh = lattice(tree["domain"]["size"], tree["nodes"]["spacing"])
+    flat = np.column_stack([mesh.nodes, np.zeros((len(mesh.nodes), 3 - mesh.nodes.shape[1]))])
+    meshio.Mesh(flat, [("triangle" if mesh.nodes.shape[1] == 2 else "tetra", mesh.cells)]).write(path)
+    return {**tree, "name": f"{tree['name']}, free nodes", "nodes": {"source": "file", "path": str(path)}}
+
+
 def main() -> int:
     """Run all; say how long each took and where the compiled code is. The exit status is the solver's."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="frit-warm-") as folder:
-        for number, tree in enumerate(CASES):
+        free = [on_free_nodes(tree, Path(folder) / f"{len(tree['domain']['size'])}.vtk") for tree in (DISCS, SPHERES)]
+        for number, tree in enumerate(CASES + free):
             start, case, directory = time.monotonic(), Path(folder) / f"{number}.json", Path(folder) / str(number)
             case.write_text(json.dumps(tree))
             commands = [[str(case), "--out", str(directory)], ["--resume", str(directory)]]
             for arguments in commands if number == 0 else commands[:1]:
                 if status := subprocess.run([sys.executable, "-P", "-m", "frit.solver", *arguments]).returncode:
                     return status
-            print(f"{tree['name']:40}{time.monotonic() - start:6.1f} s", flush=True)
+            print(f"{tree['name']:45}{time.monotonic() - start:6.1f} s", flush=True)
     print(f"compiled code is in {cache_folder()}: {time.monotonic() - began:.1f} s")
     return 0
 

@@ -45,7 +45,8 @@ def test_the_cases_that_come_along_are_accepted(path: Path) -> None:
 def test_nodes_and_points_are_those_of_the_lattice(size: tuple[float, ...], spacing: float) -> None:
     mesh = lattice(size, spacing)
     centre = [0.5 * length for length in size]
-    asked = altered({"domain.size": size, "nodes": {"source": "triangular", "spacing": spacing}, "particles": {"centres": [centre], "radii": [4]}})
+    nodes, particles = {"source": "triangular", "spacing": spacing}, {"centres": [centre], "radii": [4]}
+    asked = altered({"domain.size": size, "nodes": nodes, "particles": particles})
     found = need(resolved(asked), 1)
     assert found.nodes == pytest.approx(len(mesh.nodes), rel=0.15)
     assert found.points == pytest.approx(len(mesh.points), rel=0.25)

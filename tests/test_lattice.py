@@ -235,7 +235,6 @@ def test_windows_follow_the_fields_and_lose_nothing_that_counts() -> None:
     assert sizes.prod(axis=1).max() < 0.7 * np.prod(scheme.lattice.nodes)  # they are windows
     y = state.y.copy()
     w = 1
-    values, _ = field_of(scheme, y, w)
     assert windows.rim(y, scheme.layout, np.array(scheme.lattice.nodes), 1) < 1e-5
     row = scheme.layout.row[w] + scheme.layout.size[w, 0] // 2
     at = scheme.layout.offset[w] + (scheme.layout.size[w, 0] // 2) * scheme.layout.size[w, 2]
@@ -245,11 +244,12 @@ def test_windows_follow_the_fields_and_lose_nothing_that_counts() -> None:
     (moved,) = move(scheme, fitting_boxes(scheme, y, 1e-5), y)
     for k in range(3):
         np.testing.assert_allclose(whole(scheme, moved, k), before[k], atol=1e-5)
-    assert scheme.boxes.low[0, 2] <= scheme.boxes.low[0, 2] and not np.array_equal(scheme.boxes.size, sizes)
+    assert not np.array_equal(scheme.boxes.size, sizes)
     gone = moved.copy()
     gone[scheme.layout.offset[1] : scheme.layout.offset[2]] = 0.0  # the first particle has been consumed
     (left,) = move(scheme, fitting_boxes(scheme, gone, 1e-5), gone)
-    assert scheme.boxes.size[0].sum() == 0 and scheme.pairs.size == 0
+    assert scheme.boxes.size[0].sum() == 0
+    assert scheme.pairs.size == 0
     rate = np.empty_like(left)
     scheme.rates(left, rate)
     assert np.isfinite(rate).all()

@@ -609,6 +609,16 @@ def test_a_case_that_succeeded_once_is_not_computed_again(store: Store) -> None:
     assert store.identities([new(1).identity, new(2).identity]) == {new(1).identity: first}
 
 
+def test_a_case_that_is_on_its_way_is_not_begun_a_second_time(store: Store) -> None:
+    """Although a newer job of it was cancelled, which a sweep would try again if there were no other."""
+    first, second = done(store.submit(new(1))), done(store.submit(new(1)))
+    done(store.cancel(second.id))
+    done(store.submit_sweep("a", "{}", points(1)))
+    (point,) = store.sweep_points("a")
+    assert point.job.id == first.id
+    assert store.job(second.id).state is State.CANCELLED
+
+
 def test_points_of_the_same_case_share_a_job(store: Store) -> None:
     sweep = done(store.submit_sweep("a", "{}", points(1, 2, 1)))
     assert [point.job.seq for point in store.sweep_points(sweep.id)] == [1, 2, 1]

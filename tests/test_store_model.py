@@ -41,6 +41,9 @@ class Model:
             setattr(self, name, value)
 
 
+GOING = ("queued", "starting", "running")
+
+
 class Index(RuleBasedStateMachine):
     """Every rule is told to the store and to the model."""
 
@@ -79,7 +82,8 @@ class Index(RuleBasedStateMachine):
         for number in numbers:
             same = [i for i, job in self.jobs.items() if job.number == number]
             good = [i for i in same if self.jobs[i].state == "succeeded"]
-            one = (good or same or [self.add(number)])[-1]
+            going = [i for i in same if self.jobs[i].retrying or self.jobs[i].state in GOING]
+            one = (good or going or same or [self.add(number)])[-1]
             job = self.jobs[one]
             if job.state in ("error", "lost", "cancelled", "timed_out") and not job.retrying:
                 job.go("queued", failures=0)

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -121,7 +122,18 @@ OTHERS: list[tuple[int, dict[str, Any]]] = [
     (2, {**SPHERES, **SPAN, "time": RK2}),
     (1, {**SPHERES, "particles": {"centres": [[3.5, 4.5, 4.5]], "radii": [3.0]}, "model": {"rigid_motion": False}}),
     (2, merged(DISCS, output={"vacancy_box": [[2.0, 2.0], [9.3, 8.1]]})),
+    (2, {**DISCS, "nodes": {"source": "gmsh", "spacing": 1.0}}),
 ]
+
+
+def test_every_file_with_compiled_code_names_the_cache() -> None:
+    """Else an edit to it would leave old code in the folder."""
+    folder = Path(jit.__file__).parent
+    decorated = re.compile(r"^@(jit|inlined|exact|numba)", re.MULTILINE)
+    marked = {path.name for path in folder.glob("*.py") if decorated.search(path.read_text())}
+    assert len(marked) > 10
+    assert marked <= set(jit.COMPILED)
+    assert all((folder / name).exists() for name in jit.COMPILED)
 
 
 @pytest.mark.slow

@@ -793,7 +793,7 @@ def extremes(found: Floats, values: Floats, layers: int, count: int, cells: int,
                 wall |= count > 1 and (j == 0 or j == count - 1)
                 for i in range(GHOSTS, GHOSTS + cells):
                     value = row[i]
-                    if not value == value:
+                    if value != value:
                         found[3] = 1.0
                     found[0] = min(found[0], value)
                     if wall or i == GHOSTS or i == GHOSTS + cells - 1:

@@ -14,7 +14,7 @@ from .scheme import LatticeScheme, LatticeState
 
 GAUSS = 8  # points per cell of the integral over the vacancy box
 
-# A square cut into two triangles, a cube into six tetrahedra along its diagonal: corners as offsets (slow, middle, fast)
+# A square cut into two triangles, a cube into six tetrahedra along its diagonal: corners, slow axis first
 TRIANGLES = (((0, 0, 0), (0, 0, 1), (1, 0, 1)), ((0, 0, 0), (1, 0, 1), (1, 0, 0)))
 TETRAHEDRA = tuple(
     ((0, 0, 0), tuple(int(i == a) for i in range(3)), tuple(int(i != c) for i in range(3)), (1, 1, 1))

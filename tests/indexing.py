@@ -8,8 +8,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from frit.service.jobs import Exit, Job, Move, NewJob
-from frit.service.store import NewPoint, Store
+from frit.service.index.store import NewPoint, Store
+from frit.service.jobs.states import Exit, Job, Move, NewJob
 
 T = TypeVar("T")
 LIMIT = 3  # attempts in a row

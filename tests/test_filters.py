@@ -12,11 +12,11 @@ import sqlalchemy as sa
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from frit.service import filters
-from frit.service.jobs import Job, NewJob, State
-from frit.service.problems import HttpError
-from frit.service.schema import jobs
-from frit.service.store import NewPoint, Store
+from frit.service.http import filters
+from frit.service.http.problems import HttpError
+from frit.service.index.schema import jobs
+from frit.service.index.store import NewPoint, Store
+from frit.service.jobs.states import Job, NewJob, State
 from frit.solver.case import parse_case
 from frit.solver.variations import case_text, identity, written
 
@@ -264,9 +264,9 @@ def test_what_sweeps_are_made_of_and_lead_to_is_found_by_an_index(store: Store, 
 def test_few_and_many_jobs_that_fit_are_found_alike(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     query = {"particles.mean_radius.ge": "9"}
     few = [job.seq for job in found(store, **query)]
-    monkeypatch.setattr("frit.service.store.FEW", 3)
+    monkeypatch.setattr("frit.service.index.store.FEW", 3)
     assert [job.seq for job in found(store, **query)] == few
-    monkeypatch.setattr("frit.service.filters.NEAR", 2)
+    monkeypatch.setattr("frit.service.http.filters.NEAR", 2)
     assert [job.seq for job in found(store, **query)] == few
 
 
@@ -297,8 +297,8 @@ def test_an_index_is_made_of_what_was_asked_for_and_the_oldest_goes(
 
     before = seqs()
     assert made() == []  # of few jobs
-    monkeypatch.setattr("frit.service.store.FEW", 3)
-    monkeypatch.setattr("frit.service.store.ASKED", 3)
+    monkeypatch.setattr("frit.service.index.store.FEW", 3)
+    monkeypatch.setattr("frit.service.index.store.ASKED", 3)
     assert seqs() == before
     assert made() == ["asked_particles.seed", "asked_priority", "asked_ended"]
     assert seqs() == before

@@ -18,7 +18,7 @@ import zarr
 from asking import LONG, PACKING, TINY, Tree, final, gmsh_text, listening, service, until
 from fastapi.testclient import TestClient
 
-from frit.service.store import Store
+from frit.service.index.store import Store
 from frit.solver import amounts, mesh_file
 from frit.solver.case import parse_case
 from frit.solver.geometry import lattice
@@ -351,7 +351,7 @@ def test_a_long_history_is_never_whole_in_memory(
 
     monkeypatch.setattr(Store, "history", watched)
     for few in (1, rows - 1):
-        monkeypatch.setattr("frit.service.delivery.ROWS", few)
+        monkeypatch.setattr("frit.service.http.delivery.ROWS", few)
         for kind, before in zip(kinds, whole, strict=True):
             answer = httpx2.get(url, headers={"Accept": kind})
             assert (answer.text, answer.headers["content-type"]) == (before.text, before.headers["content-type"])

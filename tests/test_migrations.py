@@ -20,11 +20,12 @@ from alembic.runtime.migration import MigrationContext
 from indexing import done, is_whole, new, opened, rows
 from typer.testing import CliRunner
 
-from frit.service import cli, migrations
-from frit.service.engine import take
-from frit.service.jobs import State
-from frit.service.migrations import IndexVersionError
-from frit.service.schema import metadata
+from frit.service.cli import main as cli
+from frit.service.index import migrations
+from frit.service.index.migrations import IndexVersionError
+from frit.service.index.schema import metadata
+from frit.service.jobs.engine import take
+from frit.service.jobs.states import State
 
 NEWEST = migrations.versions(Path("there is none"))[1]
 
@@ -169,7 +170,7 @@ CHILD = """
 import sys
 from pathlib import Path
 from test_migrations import use
-from frit.service import migrations
+from frit.service.index import migrations
 use(Path(sys.argv[2]))
 migrations.upgrade(Path(sys.argv[1]))
 """

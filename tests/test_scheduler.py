@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from serving import ended, in_state, new_job, settings, submit, until
 
-from frit.service.engine import Engine, EngineError
-from frit.service.jobs import State
-from frit.service.scheduler import Scheduler, choose
+from frit.service.jobs.engine import Engine, EngineError
+from frit.service.jobs.scheduler import Scheduler, choose
+from frit.service.jobs.states import State
 from frit.service.settings import own_cores
 
 queues = st.lists(st.integers(1, 9), max_size=20).map(lambda ranks: list(enumerate(ranks)))
@@ -145,7 +145,7 @@ def test_a_tick_costs_one_query(tmp_path: Path) -> None:
 
             engine.store._ask = asked  # type: ignore[method-assign]
             own = engine.scheduler  # another one beside it, which nobody runs
-            idle = Scheduler(own.settings, engine.store, engine.hub, own.backend, own.follower)
+            idle = Scheduler(own.settings, engine.store, engine.notifier, own.backend, own.follower)
             idle.free = set()
             await idle.tick()
             assert statements == []

@@ -13,8 +13,8 @@ from asking import PACKING, TINY, listening, settings_in
 from hypothesis import HealthCheck, Phase, settings
 from schemathesis.checks import not_a_server_error
 
-from frit.service import tokens
-from frit.service.app import create_app
+from frit.service.http.app import create_app
+from frit.service.index import tokens
 
 SWEEP = {"name": "s", "base": PACKING, "axes": {"particles.mean_radius": [8.0, 10.0]}}
 

@@ -14,11 +14,12 @@ from asking import TINY, Process, listening, service
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from frit.service import commands_token, tokens
-from frit.service.delivery import open_beneath
-from frit.service.security import AddressError, check_address, is_loopback
+from frit.service.cli import token as commands_token
+from frit.service.http.delivery import open_beneath
+from frit.service.http.security import AddressError, check_address, is_loopback
+from frit.service.index import tokens
+from frit.service.index.store import NotFoundError, Store, StoreError
 from frit.service.settings import Settings
-from frit.service.store import NotFoundError, Store, StoreError
 
 JOB = {"case": TINY}
 

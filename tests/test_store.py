@@ -19,11 +19,11 @@ import pytest
 import sqlalchemy as sa
 from indexing import LIMIT, attempted, claim, done, ended, is_whole, lines, new, opened, points, started
 
-from frit.service import store as store_module
-from frit.service.hub import Hub
-from frit.service.jobs import Exit, Job, Move, State, TransitionError
-from frit.service.schema import jobs as table
-from frit.service.store import Key, KeyReusedError, NewPoint, NotFoundError, Store, StoreError, Transaction
+from frit.service.index import store as store_module
+from frit.service.index.schema import jobs as table
+from frit.service.index.store import Key, KeyReusedError, NewPoint, NotFoundError, Store, StoreError, Transaction
+from frit.service.jobs.notifier import Notifier
+from frit.service.jobs.states import Exit, Job, Move, State, TransitionError
 
 
 @pytest.fixture(scope="session")
@@ -204,8 +204,8 @@ def test_who_does_not_wait_any_more_is_not_served_and_stops_nobody(store: Store)
 
 
 def test_a_listener_whose_loop_is_closed_stops_nobody(store: Store) -> None:
-    async def make() -> Hub:
-        return Hub()
+    async def make() -> Notifier:
+        return Notifier()
 
     store.listeners.append(asyncio.run(make()).notify)
     assert done(store.submit(new(1))).seq == 1

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
 from indexing import LIMIT, done, is_whole, new, points, rows
 
-from frit.service.jobs import Exit, Move, TransitionError
-from frit.service.reindex import rebuild
-from frit.service.store import Store
+from frit.service.index.reindex import rebuild
+from frit.service.index.store import Store
+from frit.service.jobs.states import Exit, Move, TransitionError
 
 NUMBERS = st.integers(0, 4)
 ENDS = {

@@ -15,11 +15,11 @@ from engines import finished, job, runs_of, settings, stand_in, submit, until
 from indexing import is_whole
 from launching import PAIR
 
-from frit.service import store as store_module
-from frit.service.engine import Engine, EngineError
-from frit.service.files import try_lock
-from frit.service.jobs import Job, State
-from frit.service.store import StoreError
+from frit.service.index import store as store_module
+from frit.service.index.store import StoreError
+from frit.service.jobs.engine import Engine, EngineError
+from frit.service.jobs.processes import try_lock
+from frit.service.jobs.states import Job, State
 
 ROOM = 2_000_000  # bytes that must be free for a job to be started
 LIBRARIES = Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")

@@ -16,14 +16,15 @@ import pytest
 from serving import ended, in_state, new_job, settings, submit, until
 from soak import of_data
 
-from frit.service.backends import local
-from frit.service.backends.local import LocalBackend
-from frit.service.engine import Engine
-from frit.service.files import boot, read_json, start_of, try_lock
-from frit.service.jobs import Exit, Job, State
-from frit.service.metrics import Jobs
-from frit.service.runner import Order
-from frit.service.store import Store
+from frit.service.http.metrics import Jobs
+from frit.service.index.store import Store
+from frit.service.jobs.backends import local
+from frit.service.jobs.backends.local import LocalBackend
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.processes import boot, start_of, try_lock
+from frit.service.jobs.runner import Order
+from frit.service.jobs.states import Exit, Job, State
+from frit.solver.durable import read_json
 
 REASON = "its run folder was deleted, moved away or replaced while it had cores"
 

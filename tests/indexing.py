@@ -8,7 +8,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from frit.service.index.store import NewPoint, Store
+from frit.service.index.records import NewPoint
+from frit.service.index.store import Store
 from frit.service.jobs.states import Exit, Job, Move, NewJob
 
 T = TypeVar("T")

@@ -13,8 +13,8 @@ from launching import PAIR
 from typer.testing import CliRunner
 
 from frit.service.cli import main as cli
+from frit.service.index.records import Key, NewPoint
 from frit.service.index.reindex import rebuild
-from frit.service.index.store import Key, NewPoint
 from frit.service.jobs.engine import Engine, EngineError, take
 from frit.service.jobs.states import Move, NewJob, State
 from frit.solver.durable import write_json

@@ -135,7 +135,7 @@ def test_a_tick_costs_one_query(tmp_path: Path) -> None:
             await in_state(engine, running, State.RUNNING)
             await submit(engine, *(new_job("sleep 0", 0.001 * k) for k in range(1, 50)))
             statements: list[str] = []
-            for database in (engine.store._reader, engine.store._writer):
+            for database in (engine.store._reader, engine.store._engine):
                 sa.event.listen(database, "before_cursor_execute", lambda *a: statements.append(a[2]))
             ask = engine.store._ask
 

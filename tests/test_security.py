@@ -18,7 +18,8 @@ from frit.service.cli import token as commands_token
 from frit.service.http.delivery import open_beneath
 from frit.service.http.security import AddressError, check_address, is_loopback
 from frit.service.index import tokens
-from frit.service.index.store import NotFoundError, Store, StoreError
+from frit.service.index.records import NotFoundError, StoreError
+from frit.service.index.store import Store
 from frit.service.settings import Settings
 
 JOB = {"case": TINY}

@@ -40,8 +40,8 @@ def reindex(
     as_json: AsJson = False,
 ) -> None:
     """Make a lost or damaged index again from the journal and the run directories; what is left of it is kept."""
+    from ..index.records import StoreError
     from ..index.reindex import rebuild
-    from ..index.store import StoreError
     from ..jobs.engine import EngineError
     from ..settings import Settings
 

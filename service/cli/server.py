@@ -236,7 +236,8 @@ def compared_here(data: Path, sweep: str, observable: str) -> dict[str, Any]:
     from ..http.comparison import ObservableError
     from ..http.comparison import compare as compare_jobs
     from ..index.migrations import IndexVersionError
-    from ..index.store import NotFoundError, Store, StoreError
+    from ..index.records import NotFoundError, StoreError
+    from ..index.store import Store
 
     if not (data / "frit.db").exists():
         refuse(f"--data {data}: holds no index of jobs")

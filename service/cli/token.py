@@ -22,7 +22,7 @@ def create(
 ) -> None:
     """Make a token and print it: it cannot be shown again."""
     from ..index import tokens
-    from ..index.store import StoreError
+    from ..index.records import StoreError
 
     try:
         secret = tokens.create(data, name, scope)
@@ -37,7 +37,7 @@ def revoke(
 ) -> None:
     """Let a token count no more, from now on."""
     from ..index import tokens
-    from ..index.store import NotFoundError, StoreError
+    from ..index.records import NotFoundError, StoreError
 
     try:
         tokens.revoke(data, name)
@@ -51,7 +51,7 @@ def revoke(
 def show(data: DataFolder = Path("data"), as_json: AsJson = False) -> None:
     """List the tokens, never their secrets."""
     from ..index import tokens
-    from ..index.store import StoreError
+    from ..index.records import StoreError
 
     try:
         found = tokens.listed(data)
@@ -72,7 +72,7 @@ def show(data: DataFolder = Path("data"), as_json: AsJson = False) -> None:
 def say_if_none(data: Path) -> None:
     """On stderr: that the service answers nobody any more, and what to do."""
     from ..index import tokens
-    from ..index.store import StoreError
+    from ..index.records import StoreError
 
     try:
         shut = tokens.is_marked(data) and all(token.revoked for token in tokens.listed(data))

@@ -15,7 +15,8 @@ from frit.solver.variations import Texts, case_text, identity, written
 from frit.sweeps.definition import parse_sweep
 from frit.sweeps.expand import expand
 
-from ..index.store import NewPoint, Store
+from ..index.records import NewPoint
+from ..index.store import Store
 from ..jobs.states import NewJob, State
 from ..settings import Settings
 from .problems import HttpError, WrongField, escaped, pointer_to, refused, refused_case, shown

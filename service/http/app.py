@@ -13,7 +13,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel
 from starlette.responses import StreamingResponse
 
-from ..index.store import Key, SweepRecord
+from ..index.records import Key, SweepRecord
 from ..jobs.engine import Engine
 from ..jobs.states import SENTENCES, Job
 from ..settings import Settings
@@ -166,9 +166,8 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
 
     def page() -> tuple[views.JobPage, str | None]:
         selection = filters.select(
-            request.query_params.multi_items(), lambda name: store.sweep(name).seq,
-            lambda scalar: filters.native(scalar) or store.indexed(scalar.key, filters.sql_of(scalar)),
-        )  # fmt: skip
+            request.query_params.multi_items(), lambda name: store.sweep(name).seq
+        )
         value = None if selection.scalar is None else selection.scalar.sql
         found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.few, selection.near)
         shown = [views.summary(job, hidden(engine)) for job, _ in found[: selection.limit]]

@@ -2,7 +2,8 @@
 
 import json
 
-from ..index.store import Store, SweepRecord
+from ..index.records import SweepRecord
+from ..index.store import Store
 from . import filters, views
 
 

@@ -115,11 +115,6 @@ def _scalars(node: Mapping[str, Any], schema: Mapping[str, Any], key: str) -> It
         yield key, kind
 
 
-def sql_of(scalar: Scalar) -> str:
-    """The expression of its index."""
-    return f'"{scalar.key}"' if scalar.key in columns() else str(scalar.sql)
-
-
 def _scalar(column: str, key: str, kind: str) -> Scalar:
     prefix = "result." if column == "result" else ""
     quoted = '"case"' if column == "case" else column
@@ -158,13 +153,8 @@ def native(scalar: Scalar) -> bool:
     return scalar.key in NATIVE
 
 
-def select(
-    parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int], index: Callable[[Scalar], bool] = native
-) -> Selection:
-    """What the query parameters ask for; `sweep` gives the seq of a sweep, `index` whether there is one.
-
-    Raises `HttpError`.
-    """
+def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -> Selection:
+    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpError`."""
     wrong: list[WrongField] = []
     where: list[Condition] = []
     given: dict[str, list[str]] = {}
@@ -175,11 +165,11 @@ def select(
         raise refused("refused-query", "The query is refused", [WrongField(parameter="filters", detail=allowed)])
     by = given.get("order", ["-created"])[-1]
     asked = [name for name in given if name not in ("order", "limit", "cursor")]
-    found = {name: scalar for name in asked if (scalar := _scalar_of(name)) is not None and index(scalar)}
+    found = {name: scalar for name in asked if (scalar := _scalar_of(name)) is not None and native(scalar)}
     limit, scalar, ordered = PAGE, None, False
     try:
         scalar = _order(by)
-        ordered = scalar is not None and index(scalar)
+        ordered = scalar is not None and native(scalar)
         limit = _limit(given.get("limit", [str(PAGE)])[-1])
     except WrongQueryError as error:
         wrong.append(error.field)

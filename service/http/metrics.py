@@ -10,7 +10,7 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 from prometheus_fastapi_instrumentator import Instrumentator
 
-from ..index.store import StoreError
+from ..index.records import StoreError
 from ..jobs.engine import Engine
 
 

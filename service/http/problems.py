@@ -17,7 +17,7 @@ from starlette.routing import BaseRoute
 
 from frit.solver.case import CaseError
 
-from ..index.store import KeyReusedError, NotFoundError, StoreError
+from ..index.records import KeyReusedError, NotFoundError, StoreError
 from ..jobs.states import TransitionError
 
 MEDIA_TYPE = "application/problem+json"

@@ -15,7 +15,8 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..index.store import Store, StoreError, Token
+from ..index.records import StoreError, Token
+from ..index.store import Store
 from ..index.tokens import allows, digest, is_marked, set_mark
 from ..settings import Settings
 from .problems import HttpError, as_problem

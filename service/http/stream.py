@@ -12,7 +12,7 @@ from typing import Any
 import anyio
 from fastapi.sse import ServerSentEvent
 
-from ..index.store import NotFoundError, StoreError
+from ..index.records import NotFoundError, StoreError
 from ..jobs.engine import Engine
 from .views import moment, without_path
 

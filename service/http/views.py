@@ -9,7 +9,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from frit.solver.characters import HIDDEN
 
-from ..index.store import Attempt, SweepRecord
+from ..index.records import Attempt, SweepRecord
 from ..jobs.states import Job, State
 
 EXAMPLE_CASE: dict[str, Any] = {

@@ -24,9 +24,11 @@ from ..jobs.engine import take
 from ..jobs.processes import try_lock
 from ..jobs.runner import read_exit
 from ..jobs.states import State
+from .journal import Journal
 from .results import Reader
 from .schema import attempts, events, idempotency, jobs, sweep_jobs, sweeps
-from .store import Store, Transaction
+from .store import Store
+from .writer import Transaction
 
 T = TypeVar("T")
 Row = dict[str, Any]
@@ -71,8 +73,9 @@ def _rebuild(data: Path, attempts_limit: int) -> Rebuilt:
     finally:
         store.close()
     with suppress(FileNotFoundError):  # the ends that no journal told
-        added += store.journal.read_text()
-    append(journal, added)
+        added += store.journal.path.read_text()
+    if added:
+        Journal(journal).append(added)
     aside = swap(folder / "frit.db", data / "frit.db")
     shutil.rmtree(folder)
     return Rebuilt(states, len(book.sweeps), aside, book.problems)
@@ -248,17 +251,6 @@ def job_of(directory: Path) -> Row:
     identity = record.get("identity") or parse_case(json.loads(case)).identity()
     row = {"seq": record.get("seq"), "id": directory.name, "identity": identity, "case": case}
     return row | {key: record[key] for key in keys}
-
-
-def append(journal: Path, text: str) -> None:
-    """Durably, on a line of its own."""
-    if text:
-        with open(journal, "a+b") as file:
-            size = file.seek(0, os.SEEK_END)
-            torn = size > 0 and os.pread(file.fileno(), 1, size - 1) != b"\n"
-            file.write((b"\n" if torn else b"") + text.encode())
-            file.flush()
-            os.fsync(file.fileno())
 
 
 def swap(new: Path, path: Path) -> Path | None:

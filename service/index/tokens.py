@@ -17,7 +17,8 @@ from pathlib import Path
 from frit.solver.durable import make_private, write_whole
 
 from . import migrations
-from .store import BUSY, NotFoundError, StoreError, Token
+from .records import NotFoundError, StoreError, Token
+from .writer import BUSY
 
 SCOPES = ("read", "submit", "admin")  # each allows all that the ones before allow
 PREFIX = "frit_"

@@ -12,8 +12,9 @@ from frit.solver.durable import make_private
 from ..http.security import check_address
 from ..http.uploads import Shelf
 from ..index.migrations import IndexVersionError
+from ..index.records import Key, NewPoint, StoreError, SweepRecord
 from ..index.results import Follower
-from ..index.store import Key, NewPoint, Store, StoreError, SweepRecord
+from ..index.store import Store
 from ..settings import Settings
 from .backends.local import LocalBackend
 from .notifier import Notifier

@@ -11,8 +11,9 @@ from typing import Any
 
 from frit.solver.durable import write_json, write_whole
 
+from ..index.records import Attempt, NotFoundError, StoreError
 from ..index.results import Follower
-from ..index.store import Attempt, NotFoundError, Store, StoreError
+from ..index.store import Store
 from ..settings import Settings, own_cores
 from .backends.local import BackendError, FolderError, LocalBackend, Process
 from .notifier import Notifier

@@ -22,7 +22,8 @@ import httpx2
 from asking import PACKING, Process
 from soak import of_data, soak
 
-from frit.service.index.store import NewPoint, Store
+from frit.service.index.records import NewPoint
+from frit.service.index.store import Store
 from frit.service.jobs.engine import Engine
 from frit.service.jobs.states import Job, NewJob, State
 from frit.service.settings import Settings

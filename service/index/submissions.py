@@ -1,0 +1,196 @@
+"""New jobs and sweeps. A point of a sweep that some job has already shares it."""
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from ..jobs.states import Job, NewJob, State
+from .changes import retried, set_columns
+from .keys import known, remember, reused
+from .records import Key, KeyReusedError, NewPoint, SweepRecord, compact, find_job, find_sweep, record
+from .schema import events, idempotency, jobs, sweep_jobs, sweeps
+from .writer import Share, Transaction, Writer
+
+SUCCEEDED = 1 << 60  # more than any seq
+
+
+@dataclass(frozen=True)
+class _Submission:
+    """A job to be queued."""
+
+    job: NewJob
+    key: Key | None
+
+
+class Submissions(Writer):
+    """Part of the store."""
+
+    def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
+        """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
+        return self.put(Share(_submit, _Submission(job, key), Future()))
+
+    def submit_sweep(
+        self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
+    ) -> "Future[SweepRecord]":
+        """Queue the points of a sweep that no job has yet; jobs of the same case that were not done are tried again."""
+
+        def effect(t: Transaction) -> SweepRecord:
+            if (before := known(t, key)) is not None:
+                return find_sweep(t.connection, before)
+            row = _insert_sweep(t, name, definition, duplicates)
+            seq, identifier = row["seq"], row["id"]
+            numbers = _jobs_of_points(t, points)
+            members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
+            t.note("sweep", **row, points=members)
+            rows = [
+                {"sweep": seq, "position": i, "job": job, "name": label, "parameters": compact(parameters)}
+                for i, (job, label, parameters) in enumerate(members)
+            ]
+            t.add(sweep_jobs, rows)
+            remember(t, key, identifier)
+            return find_sweep(t.connection, identifier)
+
+        return self.write(effect)
+
+
+# --- pieces of transactions -------------------------------------------------------------------------------
+
+
+def _submit(t: Transaction, wanted: Sequence[_Submission]) -> list[Job | KeyReusedError]:
+    """Queue all that no key has brought before: a few statements, however many there are."""
+    texts = {f"{key.scope} {key.value}" for submission in wanted if (key := submission.key) is not None}
+    # by key: the fingerprint of its request, and the job's id or its place among the new ones
+    seen: dict[str, tuple[str, str | int]] = {}
+    if texts:
+        query = sa.select(idempotency).where(idempotency.c.key.in_(texts))
+        seen = {row.key: (row.fingerprint, row.resource) for row in t.run(query)}
+    new: list[NewJob] = []
+    places: list[str | int | KeyReusedError] = []
+    for submission in wanted:
+        key = submission.key
+        text = "" if key is None else f"{key.scope} {key.value}"
+        fingerprint, place = seen.get(text, (None, None))
+        if key is not None and fingerprint is not None and fingerprint != key.fingerprint:
+            places.append(reused(key))
+            continue
+        if place is None:
+            place = len(new)
+            new.append(submission.job)
+            if key is not None:
+                seen[text] = key.fingerprint, place
+        places.append(place)
+    made = _insert(t, new)
+    rows = [
+        {"key": text, "fingerprint": fingerprint, "resource": made[place].id, "created": time.time()}
+        for text, (fingerprint, place) in seen.items()
+        if isinstance(place, int)
+    ]
+    if rows:
+        t.run(idempotency.insert(), rows)
+    return [
+        place if isinstance(place, KeyReusedError) else made[place] if isinstance(place, int)
+        else find_job(t.connection, place)
+        for place in places
+    ]  # fmt: skip
+
+
+def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
+    """Queue jobs. The id is the beginning of the identity, with a number where a case comes again."""
+    now, made = time.time(), list[dict[str, Any]]()
+    base = times_before(t, [job.identity for job in new])
+    for job in new:
+        base[job.identity] = again = base.get(job.identity, 0) + 1
+        made.append(
+            {"id": job.identity[:16] + (f"-{again}" if again > 1 else ""), "name": job.name, "identity": job.identity,
+             "state": State.QUEUED.value, "priority": job.priority, "ranks": job.ranks, "tags": job.tags,
+             "time_limit": job.time_limit, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
+             "created": now, "result": {}, "case": job.case}
+        )  # fmt: skip
+    if not made:
+        return []
+    t.add(jobs, [{**row, "tags": compact(row["tags"]), "result": "{}"} for row in made])
+    [(last,)] = t.ask("SELECT max(seq) FROM jobs")
+    numbers = range(last - len(made) + 1, last + 1)
+    t.add(events, [{"job": seq, "at": now, "state": "queued"} for seq in numbers])
+    for seq, row in zip(numbers, made, strict=True):
+        t.note("job", seq=seq, **row)
+    t.durable = True
+    empty = {"message": None, "started": None, "ended": None, "core_seconds": None, "state": State.QUEUED}
+    return [Job(**{**row, **empty, "seq": seq}) for seq, row in zip(numbers, made, strict=True)]
+
+
+def times_before(t: Transaction, which: Sequence[str]) -> dict[str, int]:
+    """How many jobs each identity has had."""
+    found: dict[str, int] = {}
+    for k in range(0, len(which), 500):
+        part = which[k : k + 500]
+        marks = ", ".join("?" * len(part))
+        query = f"SELECT identity, count(*) FROM jobs WHERE identity IN ({marks}) GROUP BY identity"
+        found |= dict(t.ask(query, part))
+    return found
+
+
+def existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
+    """The seq of a job of each identity: of one that succeeded, if any did, else of the newest."""
+    done = sa.case((jobs.c.state == State.SUCCEEDED, SUCCEEDED), else_=0)
+    found: dict[str, int] = {}
+    for k in range(0, len(which), 500):
+        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq + done)).where(jobs.c.identity.in_(which[k : k + 500]))
+        found |= {identity: seq % SUCCEEDED for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
+    return found
+
+
+def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
+    """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done.
+
+    Whoever queued the old one may have wished for less: it gets the priority, the time and the ranks asked for now.
+    """
+    asked = {point.job.identity: point.job for point in points}
+    numbers = existing(t.connection, list(asked))
+    old = list(numbers.values())
+    undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
+    waiting = (jobs.c.state == State.QUEUED) | jobs.c.retrying
+    urgent = max((job.priority for job in asked.values()), default=0)
+    modest = waiting & ((jobs.c.priority < urgent) | jobs.c.time_limit.is_not(None))
+    small = (jobs.c.state == State.FAILED) & (jobs.c.ranks < max((job.ranks for job in asked.values()), default=1))
+    for k in range(0, len(old), 500):
+        query = sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]), undone | modest | small)
+        for row in t.run(query).all():
+            job, more = record(row), _more(row, asked[row.identity])
+            if job.state is State.QUEUED or job.retrying:
+                if more:
+                    set_columns(t, job, **more)
+            elif job.state is not State.FAILED:
+                retried(t, job, **more)
+            elif job.ranks < asked[job.identity].ranks:  # it may have been short of memory, which goes with the ranks
+                retried(t, job, **more, ranks=asked[job.identity].ranks)
+    missing: dict[str, NewJob] = {}
+    for point in points:
+        if point.job.identity not in numbers:
+            missing.setdefault(point.job.identity, point.job)
+    new = _insert(t, list(missing.values()))
+    return numbers | {job.identity: job.seq for job in new}
+
+
+def _more(job: Any, asked: NewJob) -> dict[str, Any]:
+    """What a job lacks of the priority and the time that are asked for."""
+    more: dict[str, Any] = {}
+    if asked.priority > job.priority:
+        more["priority"] = asked.priority
+    if job.time_limit is not None and (asked.time_limit is None or asked.time_limit > job.time_limit):
+        more["time_limit"] = asked.time_limit
+    return more
+
+
+def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> dict[str, Any]:
+    seq = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
+    row = {"seq": seq, "id": f"s{seq}", "name": name, "definition": definition, "duplicates": duplicates}
+    row["created"] = time.time()
+    t.run(sweeps.insert(), [row])
+    t.durable = True
+    return row

@@ -51,7 +51,7 @@ def claim(store: Store, job: Job) -> Job:
 def started(store: Store, job: Job) -> Job:
     """Give a queued job a core and a runner."""
     claimed = claim(store, job)
-    return done(store.start(claimed.id, claimed.attempt, 4711, 1234, "boot"))
+    return done(store.start(claimed.id, claimed.attempt, {"pid": 4711}))
 
 
 def ended(store: Store, job: Job, move: Move, message: str | None = None) -> Job:

@@ -1,5 +1,6 @@
 """Versions of the index: a stored old one is refused by name, upgraded whole or not at all, and kept."""
 
+import json
 import os
 import shutil
 import signal
@@ -30,6 +31,7 @@ from frit.service.jobs.states import State
 NEWEST = migrations.versions(Path("there is none"))[1]
 
 OLD = Path(__file__).parent / "data" / "index-0001.sql"
+PROCESS = {"pid": "pid", "start": "pid_start", "boot": "boot"}
 TABLES = ["sweeps", "jobs", "sweep_jobs", "attempts", "history", "snapshots", "events", "tokens", "idempotency"]
 
 
@@ -71,8 +73,15 @@ def test_the_command_upgrades_it_and_keeps_every_row_and_a_copy(old: Path) -> No
     status, printed = frit("db", "upgrade", "--data", str(old))
     assert (status, printed) == (0, f"{path}: version {NEWEST}, was 0001, which is kept as {path}.0001\n")
     after = content(path)
-    assert [row.pop("duplicates") for row in after["sweeps"]] == [0, 0]
-    assert after == before == content(Path(f"{path}.0001"))
+    assert before == content(Path(f"{path}.0001"))
+    assert [(row.pop("duplicates"), row.pop("owner")) for row in after["sweeps"]] == [(0, None)] * 2
+    for row in after["jobs"]:
+        assert [row.pop(key) for key in ("owner", "origin", "bytes")] == [None] * 3
+    for row in (*before["attempts"], *after["attempts"]):
+        process = {name: row.pop(key, None) for name, key in PROCESS.items()}
+        row["handle"] = json.loads(row.get("handle") or json.dumps(process))
+    assert after == before
+    assert any(row["handle"]["pid"] for row in after["attempts"])
     assert (version(path), version(Path(f"{path}.0001"))) == (NEWEST, "0001")
     assert is_whole(path)
     assert frit("db", "upgrade", "--data", str(old)) == (0, f"{path}: version {NEWEST} already\n")

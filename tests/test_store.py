@@ -311,7 +311,7 @@ def test_the_same_case_again_is_another_job_with_a_number(store: Store) -> None:
 def test_start_and_finish_told_twice_count_once(store: Store) -> None:
     job = claim(store, done(store.submit(new(1))))
     for _ in range(2):
-        running = done(store.start(job.id, 1, 11, 12, "b"))
+        running = done(store.start(job.id, 1, {"pid": 11}))
     assert running.state is State.RUNNING
     for _ in range(2):
         over = ended(store, job, Move.SUCCEED)
@@ -319,14 +319,14 @@ def test_start_and_finish_told_twice_count_once(store: Store) -> None:
     assert ended(store, job, Move.BREAK).state is State.SUCCEEDED
     assert [event.state for event in store.events(job.id)] == ["queued", "starting", "running", "succeeded"]
     (attempt,) = store.attempts(job.id)
-    assert (attempt.pid, attempt.pid_start, attempt.boot, attempt.cores) == (11, 12, "b", (0,))
+    assert (attempt.handle, attempt.cores) == ({"pid": 11}, (0,))
     assert (attempt.state, attempt.ended, attempt.core_seconds) == ("succeeded", 2000.0, 10.0)
 
 
 def test_word_of_another_attempt_is_ignored(store: Store) -> None:
     job = claim(store, done(store.submit(new(1))))
     for attempt in (0, 2):
-        assert done(store.start(job.id, attempt, 1, 2, "b")).state is State.STARTING
+        assert done(store.start(job.id, attempt, {"pid": 1})).state is State.STARTING
         assert done(store.finish(job.id, Exit(attempt, Move.SUCCEED, None, 1.0), LIMIT)).state is State.STARTING
     assert not done(store.requeue(job.id, 0)).retrying
 
@@ -414,7 +414,7 @@ def test_what_goes_on_or_went_well_is_not_retried(store: Store, state: str) -> N
 
 
 def test_no_such_job(store: Store) -> None:
-    for ask in (store.cancel, store.retry, lambda i: store.requeue(i, 1), lambda i: store.start(i, 1, 1, 1, "")):
+    for ask in (store.cancel, store.retry, lambda i: store.requeue(i, 1), lambda i: store.start(i, 1, {})):
         with pytest.raises(NotFoundError, match="'nobody'"):
             done(ask("nobody"))
     for look in (store.job, store.attempts, store.events, store.history, store.snapshots, store.sweep):
@@ -428,10 +428,10 @@ def test_no_such_job(store: Store) -> None:
 def test_the_queue_is_by_priority_then_age(store: Store) -> None:
     for k, priority in enumerate([0, 5, 0, -1, 5]):
         done(store.submit(new(k, priority=priority, ranks=k + 1)))
-    assert store.queued(10) == [(2, 2), (5, 5), (1, 1), (3, 3), (4, 4)]
-    assert store.queued(2) == [(2, 2), (5, 5)]
+    assert [job.seq for job in store.queued(10)] == [2, 5, 1, 3, 4]
+    assert [job.ranks for job in store.queued(2)] == [2, 5]
     claim(store, store.job(new(1).identity[:16]))
-    assert store.queued(1) == [(5, 5)]
+    assert [job.seq for job in store.queued(1)] == [5]
 
 
 def test_the_queue_is_read_from_its_index(store: Store) -> None:
@@ -449,7 +449,7 @@ def test_what_an_earlier_service_left(store: Store) -> None:
     attempted(store, pausing, Move.LOSE)
     attempted(store, over, Move.FAIL)
     active, waiting = store.unfinished()
-    assert {(job.id, attempt.number, attempt.pid) for job, attempt in active} == {
+    assert {(job.id, attempt.number, (attempt.handle or {}).get("pid")) for job, attempt in active} == {
         (up.id, 1, None), (busy.id, 1, 4711)
     }  # fmt: skip
     assert [job.id for job in waiting] == [pausing.id]

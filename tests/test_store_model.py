@@ -107,7 +107,7 @@ class Index(RuleBasedStateMachine):
     @rule(one=ids, late=st.sampled_from([0, 0, 0, 1]))
     def start(self, one: str, late: int) -> None:
         job = self.jobs[one]
-        done(self.store.start(one, job.attempt - late, 1, 2, "boot"))
+        done(self.store.start(one, job.attempt - late, {"pid": 1}))
         if job.state == "starting" and not late:
             job.go("running")
 

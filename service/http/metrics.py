@@ -39,10 +39,10 @@ class Jobs(Collector):
         ready.add_metric([], float(engine.trouble() is None))
         yield ready
         scheduler = engine.scheduler
-        total, stuck = engine.settings.cores, scheduler.stuck_cores()
+        total, stuck = scheduler.backend.total, scheduler.stuck_cores()
         for name, words, value in (
             ("frit_cores", "Processors given to jobs.", total),
-            ("frit_cores_busy", "Processors that jobs have now.", total - len(scheduler.free)),
+            ("frit_cores_busy", "Processors that jobs have now.", total - scheduler.backend.free),
             ("frit_cores_stuck", "Processors of jobs of which nobody knows whether they live.", stuck),
         ):
             cores = GaugeMetricFamily(name, words)

@@ -20,7 +20,7 @@ class _Start:
 
     job: str
     attempt: int
-    process: Mapping[str, Any]
+    handle: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,9 @@ class Changes(Writer):
 
         return self.write(effect)
 
-    def start(self, identifier: str, attempt: int, pid: int, pid_start: int, boot: str) -> "Future[Job]":
+    def start(self, identifier: str, attempt: int, handle: Mapping[str, Any]) -> "Future[Job]":
         """The runner of an attempt has recorded itself. Told twice it counts once."""
-        process = {"pid": pid, "pid_start": pid_start, "boot": boot}
-        return self.put(Share(_start, _Start(identifier, attempt, process), Future()))
+        return self.put(Share(_start, _Start(identifier, attempt, handle), Future()))
 
     def finish(
         self, identifier: str, end: Exit, attempts_limit: int, result: Mapping[str, Any] | None = None
@@ -185,7 +184,7 @@ def _start(t: Transaction, wanted: Sequence[_Start]) -> list[Job | NotFoundError
     for start in wanted:
         job = known[start.job]
         if isinstance(job, Job) and (job.attempt, job.state) == (start.attempt, State.STARTING):
-            rows.append(_of_attempt(t, job, start.process))
+            rows.append({**_of_attempt(t, job, {"handle": start.handle}), "handle": compact(start.handle)})
             known[start.job] = moves.add(job, Move.START, None)
     return _moved(t, rows, moves, [known[start.job] for start in wanted])
 

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 from sqlalchemy.exc import DBAPIError
 
-from ..jobs.states import Job, State
+from ..jobs.states import Job, State, Waiting
 from . import keys
 from .records import (
     BRIEF,
@@ -107,10 +107,10 @@ class Queries:
             records = {row.seq: record(row) for row in rows}
         return [(records[seq], at) for seq, at in places]
 
-    def queued(self, limit: int) -> list[tuple[int, int]]:
-        """(seq, ranks) of the first jobs in the queue: by priority, then by age."""
-        query = "SELECT seq, ranks FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
-        return self._ask(query, (State.QUEUED, limit))
+    def queued(self, limit: int) -> list[Waiting]:
+        """The first jobs in the queue: by priority, then by age."""
+        query = "SELECT seq, ranks, owner FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
+        return [Waiting(*row) for row in self._ask(query, (State.QUEUED, limit))]
 
     def unfinished(self) -> tuple[list[tuple[Job, Attempt]], list[Job]]:
         """Jobs that have cores with their present attempt, and jobs that wait for another attempt."""

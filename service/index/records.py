@@ -43,6 +43,7 @@ class SweepRecord:
     definition: str
     duplicates: int
     created: float
+    owner: str | None
     points: int
     states: dict[str, int]
 
@@ -77,19 +78,17 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One try at a job: the cores it had, and its runner's process once that has recorded itself."""
+    """One try at a job: the cores it had, and its runner once that has recorded itself."""
 
     job: str
     number: int
     cores: tuple[int, ...]
     claimed: float
-    pid: int | None
-    pid_start: int | None
-    boot: str | None
     ended: float | None
     state: str | None
     message: str | None
     core_seconds: float | None
+    handle: dict[str, Any] | None  # the backend's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +123,7 @@ def record(row: Row[Any]) -> Job:
         failures=values["failures"], retrying=values["retrying"], stopping=values["stopping"],
         created=values["created"], started=values["started"], ended=values["ended"],
         core_seconds=values["core_seconds"], result=values["result"], case=values["case"],
+        owner=values["owner"], origin=values["origin"], bytes=values["bytes"],
     )  # fmt: skip
 
 
@@ -158,8 +158,8 @@ def attempts_of(connection: Connection, job: Job) -> list[Attempt]:
     """First to last."""
     query = sa.select(attempts).where(attempts.c.job == job.seq).order_by(attempts.c.number)
     return [
-        Attempt(job.id, row.number, tuple(row.cores), row.claimed, row.pid, row.pid_start, row.boot, row.ended,
-                row.state, row.message, row.core_seconds)
+        Attempt(job.id, row.number, tuple(row.cores), row.claimed, row.ended, row.state, row.message,
+                row.core_seconds, row.handle)
         for row in connection.execute(query)
     ]  # fmt: skip
 
@@ -175,5 +175,5 @@ def find_sweep(connection: Connection, identifier: str) -> SweepRecord:
     grouped = sa.select(jobs.c.state, sa.func.count()).join_from(sweep_jobs, jobs).group_by(jobs.c.state)
     states = {state: n for state, n in connection.execute(grouped.where(sweep_jobs.c.sweep == row.seq))}
     return SweepRecord(
-        row.seq, row.id, row.name, row.definition, row.duplicates, row.created, sum(states.values()), states
+        row.seq, row.id, row.name, row.definition, row.duplicates, row.created, row.owner, sum(states.values()), states
     )

@@ -34,9 +34,10 @@ T = TypeVar("T")
 Row = dict[str, Any]
 FRESH: Row = {
     "state": State.QUEUED, "message": None, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
-    "started": None, "ended": None, "core_seconds": None, "result": {},
+    "started": None, "ended": None, "core_seconds": None, "result": {}, "owner": None, "origin": None, "bytes": None,
 }  # fmt: skip
-CLAIMED: Row = dict.fromkeys(("pid", "pid_start", "boot", "ended", "state", "message", "core_seconds"))
+PROCESS = {"pid": "pid", "pid_start": "start", "boot": "boot"}
+CLAIMED: Row = dict.fromkeys(("ended", "state", "message", "core_seconds", "handle"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +119,11 @@ class Book:
                 self._set(self.jobs[line["job"]], line["values"], line["event"])
             case "attempt":
                 where = (line["job"], line["number"])
+                if "pid" in line:  # as it was written before backends had handles
+                    line["handle"] = {name: line.pop(key) for key, name in PROCESS.items()}
                 self.attempts[where] = self.attempts.get(where, CLAIMED) | line
             case "sweep":
-                self.sweeps[line["seq"]] = whole(sweeps, line) | {"points": line["points"]}
+                self.sweeps[line["seq"]] = whole(sweeps, {"owner": None, **line}) | {"points": line["points"]}
             case "key":
                 self.keys[line["key"]] = whole(idempotency, line)
             case kind:
@@ -182,8 +185,8 @@ class Book:
             yield {"kind": "set", "job": seq, "event": at, "values": {**values, "started": row["started"] or at}}
             yield {"kind": "attempt", "job": seq, "number": number, "cores": record["cores"], "claimed": at}
         if number and number >= row["attempt"] and state == State.STARTING:
-            process = {key: record[key] for key in ("pid", "pid_start", "boot")}
-            yield {"kind": "attempt", "job": seq, "number": number, **process}
+            handle = {name: record[key] for key, name in PROCESS.items()}
+            yield {"kind": "attempt", "job": seq, "number": number, "handle": handle}
             yield {"kind": "set", "job": seq, "event": at, "values": {"state": State.RUNNING, "message": None}}
 
     # --- the new index ------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ sweeps = Table(
     Column("definition", Text, nullable=False),  # JSON, as `Sweep.resolved_json` gives it
     Column("duplicates", Integer, nullable=False, server_default="0"),
     Column("created", Float, nullable=False),
+    Column("owner", Text),  # the label of the token that made it
     sqlite_autoincrement=True,
 )
 
@@ -60,17 +61,21 @@ jobs = Table(
     Column("core_seconds", Float),
     Column("result", JSON, nullable=False),
     Column("case", Text, nullable=False),  # the resolved case, compact JSON
+    Column("owner", Text),  # the label of the token that made it
+    Column("origin", String),  # the id of the job that this one is a rerun of
+    Column("bytes", Integer),  # of its run directory, at the end of its last attempt
     sqlite_autoincrement=True,
 )
 Index("ix_jobs_name", jobs.c.name)
 Index("ix_jobs_queue", jobs.c.state, jobs.c.priority.desc(), jobs.c.seq)
 Index("ix_jobs_state_seq", jobs.c.state, jobs.c.seq)
+Index("ix_jobs_owner_state", jobs.c.owner, jobs.c.state)
 for key in ("mean_radius", "std_radius", "packing_density"):  # what sweeps are made of
     Index(f"ix_jobs_{key}", func.json_extract(jobs.c.case, literal_column(f"'$.particles.{key}'")))
 # ... and what they lead to
 Index("ix_jobs_vacancy_ratio", func.json_extract(jobs.c.result, literal_column("'$.vacancy_ratio'")))
 
-job_tags = Table(  # filled by a trigger on `jobs`
+job_tags = Table(  # filled by triggers on `jobs`
     "job_tags",
     metadata,
     Column("tag", Text, primary_key=True),
@@ -95,13 +100,11 @@ attempts = Table(
     Column("number", Integer, primary_key=True),
     Column("cores", JSON, nullable=False),
     Column("claimed", Float, nullable=False),
-    Column("pid", Integer),
-    Column("pid_start", Integer),  # clock ticks after boot: with the boot's id it tells a reused pid
-    Column("boot", String),
     Column("ended", Float),
     Column("state", String),
     Column("message", Text),
     Column("core_seconds", Float),
+    Column("handle", JSON(none_as_null=True)),  # how the backend finds the runner again
 )
 
 history = Table(
@@ -132,6 +135,20 @@ events = Table(
     Column("message", Text),
     Index("ix_events_job_seq", "job", "seq"),
     sqlite_autoincrement=True,
+)
+
+removed = Table(  # jobs and sweeps that are gone for good
+    "removed",
+    metadata,
+    Column("event", Integer, primary_key=True),  # a number of the events' own
+    Column("kind", String, nullable=False),  # job or sweep
+    Column("seq", Integer, nullable=False),
+    Column("id", String, nullable=False),
+    Column("identity", String, index=True),  # of a job: its id is not given again
+    Column("owner", Text),
+    Column("at", Float, nullable=False),
+    Column("core_seconds", Float),
+    Column("done", Boolean, nullable=False),  # whether the journal knows, and the folder is gone
 )
 
 tokens = Table(

@@ -17,6 +17,7 @@ from ..index.results import Follower
 from ..index.store import Store
 from ..settings import Settings
 from .backends.local import LocalBackend
+from .backends.protocol import Backend
 from .notifier import Notifier
 from .processes import try_lock
 from .scheduler import Scheduler
@@ -41,8 +42,10 @@ class Engine:
     scheduler: Scheduler
     shelf: Shelf
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, backend: Backend | None = None) -> None:
+        """backend: where jobs run; the cores of this machine unless told."""
         self.settings = settings
+        self._backend = backend
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -56,8 +59,9 @@ class Engine:
             stack.callback(self.store.close)
             self.notifier = Notifier()
             self.store.listeners.append(self.notifier.notify)
+            backend = self._backend or LocalBackend(self.settings.cores, self.settings.patience)
             self._follower = Follower(self.store, self.settings.runs)
-            self.scheduler = Scheduler(self.settings, self.store, self.notifier, LocalBackend(), self._follower)
+            self.scheduler = Scheduler(self.settings, self.store, self.notifier, backend, self._follower)
             stack.push_async_callback(self.scheduler.close)
             await self.scheduler.adopt()
             loop = asyncio.create_task(self.scheduler.run())

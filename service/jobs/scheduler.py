@@ -1,11 +1,14 @@
-"""Which job gets which cores, and when; and one watch per job that has them."""
+"""Which jobs are put before the backend, and when; and one watch per job that it has started.
+
+What cores and processes are, the backend knows.
+"""
 
 import asyncio
 import logging
 import shutil
 import signal
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +17,11 @@ from frit.solver.durable import write_json, write_whole
 from ..index.records import Attempt, NotFoundError, StoreError
 from ..index.results import Follower
 from ..index.store import Store
-from ..settings import Settings, own_cores
-from .backends.local import BackendError, FolderError, LocalBackend, Process
+from ..settings import Settings
+from .backends.protocol import Backend, BackendError, FolderError, Handle
 from .notifier import Notifier
-from .processes import boot, start_of
 from .runner import Order, advanced
-from .states import Exit, Job, Move, State, one_sentence
+from .states import Exit, Job, Move, State, Waiting, one_sentence
 
 AHEAD = 256  # jobs of the queue that one tick looks at
 TICK = 1.0  # seconds between two ticks when nothing happens
@@ -29,46 +31,21 @@ READINGS = 5  # times that what a job has left behind is read in vain before it 
 logger = logging.getLogger("frit.scheduler")
 
 
-def choose(queue: Sequence[tuple[int, int]], free: int, total: int, overtake: Callable[[int], bool]) -> list[int]:
-    """Which jobs of the queue, (seq, ranks) by priority and age, get some of the `free` of all `total` cores now.
-
-    In order, as long as they fit. `overtake` is asked about the first that does not fit: whether smaller ones behind
-    it may go first; if not, cores are kept until they suffice. A job with more ranks than there are cores at all waits
-    for another service and blocks nobody.
-    """
-    chosen: list[int] = []
-    blocked = False
-    for seq, ranks in queue:
-        if ranks <= free:
-            chosen.append(seq)
-            free -= ranks
-        elif ranks <= total and not blocked:
-            blocked = True
-            if not overtake(seq):
-                break
-    return chosen
-
-
 class Scheduler:
     """Belongs to one event loop, as its store's notifier does."""
 
     def __init__(
-        self, settings: Settings, store: Store, notifier: Notifier, backend: LocalBackend, follower: Follower
+        self, settings: Settings, store: Store, notifier: Notifier, backend: Backend, follower: Follower
     ) -> None:
         self.settings, self.store, self.notifier = settings, store, notifier
         self.backend, self.follower = backend, follower
-        own = own_cores()
-        self.cores = [own[k % len(own)] for k in range(settings.cores)]
-        self.free = set(range(settings.cores))  # numbers of self.cores
         self.running: dict[str, Job] = {}  # with cores, by id
-        self.held: dict[str, set[int]] = {}  # the cores of those
         self.stuck: dict[str, str] = {}  # jobs whose watch has failed, and how: nobody knows whether they live
         self.open = True  # whether to start jobs
         self._said: str | None = "starting up"
         self._closing = False
         self._tasks: set[asyncio.Task[None]] = set()
-        self._births: set[asyncio.Task[int]] = set()  # of runners
-        self._first: tuple[int, float] | None = None  # the job that waits for cores, and since when
+        self._births: set[asyncio.Task[Handle | None]] = set()  # of runners
 
     @property
     def trouble(self) -> str | None:
@@ -78,7 +55,7 @@ class Scheduler:
 
     def stuck_cores(self) -> int:
         """How many cores are held by jobs of which nobody knows whether they live."""
-        return sum(len(self.held.get(job, ())) for job in self.stuck)
+        return sum(self.running[job].ranks for job in self.stuck if job in self.running)
 
     # --- the loop -----------------------------------------------------------------------------------------
 
@@ -86,8 +63,8 @@ class Scheduler:
         """Take over what an earlier service has left: running jobs, unread exit records, pauses."""
         held, waiting = await asyncio.to_thread(self.store.unfinished)
         for job, attempt in held:
-            cores = self._cores_again(attempt.cores)
-            self.running[job.id], self.held[job.id] = job, cores
+            self.backend.hold(job.id, job.ranks, attempt.cores)
+            self.running[job.id] = job
             self.follower.follow(job)
             message = "the service ended before it had started a runner"
             self._attend(job, self._adopt(job, attempt, Exit(job.attempt, Move.RELEASE, message, time.time())))
@@ -111,35 +88,22 @@ class Scheduler:
             await self.notifier.wait(TICK, seen)
 
     async def tick(self) -> None:
-        """Give free cores to the jobs whose turn it is: one query, and one transaction if there are any."""
-        if not (self.free and self.open) or self._disk() is not None:
+        """Start the jobs whose turn it is: one query, and one transaction if there are any."""
+        if not (self.backend.free and self.open) or self._disk() is not None:
             return
-        choices, free = [], sorted(self.free)
-        queue = self._ahead(len(free))
-        ranks = dict(queue)
-        for seq in choose(queue, len(free), len(self.cores), self._overtake):
-            choices.append((seq, free[: ranks[seq]]))
-            free = free[ranks[seq] :]
+        choices = self.backend.may_start(self._ahead(self.backend.free))
         if not choices:
             return
-        claim = self.store.claim([(seq, tuple(self.cores[k] for k in numbers)) for seq, numbers in choices])
-        given = dict(choices)
-        for job in await asyncio.wrap_future(claim):
-            self.held[job.id] = set(given[job.seq])
-            self.free -= self.held[job.id]
+        cores = dict(choices)
+        for job in await asyncio.wrap_future(self.store.claim(choices)):
             self.running[job.id] = job
-            self._attend(job, self._start(job))
+            self._attend(job, self._start(job, self.backend.hold(job.id, job.ranks, cores[job.seq])))
 
-    def _ahead(self, free: int) -> list[tuple[int, int]]:
-        """(seq, ranks) of the first in the queue: as many as there are cores free where those fit, else `AHEAD`."""
+    def _ahead(self, free: int) -> list[Waiting]:
+        """The first in the queue: as many as there are cores free where those fit, else `AHEAD`."""
         queue = self.store.queued(free)
-        return queue if sum(ranks for _, ranks in queue) <= free or len(queue) < free else self.store.queued(AHEAD)
-
-    def _overtake(self, first: int) -> bool:
-        """Whether the first job that does not fit may be overtaken: for a while since it became the first."""
-        if self._first is None or self._first[0] != first:
-            self._first = (first, time.monotonic())
-        return time.monotonic() - self._first[1] < self.settings.patience
+        fit = sum(job.ranks for job in queue) <= free or len(queue) < free
+        return queue if fit else self.store.queued(AHEAD)
 
     async def stop(self, job: Job, reason: str) -> None:
         """Tell a job's runner to checkpoint and end; `reason` is one of runner.STOPS."""
@@ -177,46 +141,42 @@ class Scheduler:
 
     # --- one job ------------------------------------------------------------------------------------------
 
-    async def _start(self, job: Job) -> None:
+    async def _start(self, job: Job, cores: tuple[int, ...]) -> None:
         directory = self.settings.runs / job.id
         order = Order(
-            job.attempt, str(directory), job.ranks, tuple(self.cores[k] for k in sorted(self.held[job.id])),
-            job.time_limit, self.settings.grace, self.settings.memory_limit,
+            job.attempt, str(directory), job.ranks, cores, job.time_limit, self.settings.grace,
+            self.settings.memory_limit,
         )  # fmt: skip
         self.follower.follow(job)
         try:
             birth = asyncio.create_task(self._bear(job, order))
             self._births.add(birth)
             birth.add_done_callback(self._births.discard)
-            pid = await asyncio.shield(birth)
+            handle = await asyncio.shield(birth)
         except FolderError as error:
             return await self._lose(job, error)
         except (BackendError, OSError) as error:
             logger.warning("job %s: %s", job.id, error)
-            record = await self._recorded(job)
-            if record is None:
+            handle = await self._find(job)
+            if handle is None:  # else it was started all the same: only the answer was lost
                 return await self._end(job, Exit(job.attempt, Move.BREAK, one_sentence(str(error)), time.time()))
-            pid = int(record["pid"])  # it was forked all the same: only the answer was lost
-        process, beside = None, None
-        if (started := start_of(pid)) is not None:
-            process = Process(pid, started, boot())
-            beside = self._spawn(self._started(job, process))
-        await self._watch(job, process, beside)
+        beside = None if handle is None else self._spawn(self._started(job, handle))
+        await self._watch(job, handle, beside)
 
-    async def _bear(self, job: Job, order: Order) -> int:
+    async def _bear(self, job: Job, order: Order) -> Handle | None:
         """Not to be cut short: a claimed job gets its runner."""
         await asyncio.to_thread(make_directory, Path(order.directory), job)
         return await self.backend.start(order)
 
-    async def _recorded(self, job: Job) -> dict[str, Any] | None:
-        """What the attempt's runner has recorded of itself; None where there is none, or no folder."""
+    async def _find(self, job: Job) -> Handle | None:
+        """The attempt's runner; None where there is none, or no folder."""
         try:
-            return await self.backend.recorded(self.settings.runs / job.id, job.attempt)
+            return await self.backend.find(self.settings.runs / job.id, job.attempt)
         except FolderError:
             return None
 
-    async def _started(self, job: Job, process: Process) -> None:
-        recorded = await self._insist(lambda: self.store.start(job.id, job.attempt, *process))
+    async def _started(self, job: Job, handle: Handle) -> None:
+        recorded = await self._insist(lambda: self.store.start(job.id, job.attempt, handle))
         if recorded.attempt == job.attempt and job.id in self.running:
             self.running[job.id] = recorded
             if recorded.stopping:  # the wish came before there was a runner to tell
@@ -224,23 +184,21 @@ class Scheduler:
 
     async def _adopt(self, job: Job, attempt: Attempt, unborn: Exit) -> None:
         """Watch a runner that was started before; `unborn`: what is said where it did not come to that."""
-        record, process = await self._recorded(job), process_of(attempt)
-        if record is None and job.state is State.STARTING:
-            await self.backend.clear(self.settings.runs / job.id, process)  # of one whose folder is gone
+        found, known = await self._find(job), attempt.handle
+        if found is None and job.state is State.STARTING:
+            await self.backend.clear(self.settings.runs / job.id, known)  # of one whose folder is gone
             return await self._end(job, unborn)
-        if record is not None:
-            process = Process(record["pid"], record["pid_start"], record["boot"])
-            await self._started(job, process)
-        await self._watch(job, process)
+        if found is not None:
+            await self._started(job, found)
+        await self._watch(job, found or known)
 
-    async def _watch(self, job: Job, process: Process | None = None, beside: asyncio.Task[None] | None = None) -> None:
+    async def _watch(self, job: Job, handle: Handle | None = None, beside: asyncio.Task[None] | None = None) -> None:
         """To the end of the job's runner, which may have come already; `beside`: what has to be told before that."""
         directory = self.settings.runs / job.id
-        pid = None if process is None or beside is None else process.pid
         try:
-            end = await self.backend.ended(directory, job.attempt, pid, lambda: self._well(job))
+            end = await self.backend.ended(directory, job.attempt, handle, lambda: self._well(job))
         except FolderError as error:
-            return await self._lose(job, error, process)
+            return await self._lose(job, error, handle)
         if beside is not None:
             await asyncio.wait([beside])
         if end is None:
@@ -248,12 +206,12 @@ class Scheduler:
             end = Exit(job.attempt, Move.LOSE, message, time.time(), advanced=further)
         await self._end(job, end)
 
-    async def _lose(self, job: Job, error: FolderError, process: Process | None = None) -> None:
+    async def _lose(self, job: Job, error: FolderError, handle: Handle | None = None) -> None:
         """For good: there is nothing left to go on with, and nobody is to compute into the void.
 
         Where the folder of all runs is gone too, a disk is: its jobs may go on once it is back.
         """
-        await self.backend.clear(self.settings.runs / job.id, process)
+        await self.backend.clear(self.settings.runs / job.id, handle)
         again = not self.settings.runs.is_dir()
         await self._end(job, Exit(job.attempt, Move.LOSE, str(error), time.time(), again=again))
 
@@ -292,7 +250,7 @@ class Scheduler:
     def _give_back(self, job: Job) -> None:
         """Free what a job that has ended had."""
         self.running.pop(job.id, None)
-        self.free |= self.held.pop(job.id, set())
+        self.backend.release(job.id)
         self._well(job)
 
     async def _pause(self, job: Job) -> None:
@@ -329,7 +287,7 @@ class Scheduler:
 
     def _unattended(self, job: Job, task: asyncio.Task[None]) -> None:
         """Its work is over, but is the job?"""
-        if self._closing or self.running.get(job.id, job).attempt != job.attempt or job.id not in self.held:
+        if self._closing or job.id not in self.running or self.running[job.id].attempt != job.attempt:
             return
         error = None if task.cancelled() else task.exception()
         self.stuck[job.id] = "it was cut short" if error is None else f"{type(error).__name__}: {error}"
@@ -370,15 +328,6 @@ class Scheduler:
             return None
         return f"{self.settings.data}: {free} bytes free, no job is started below {self.settings.free_disk}"
 
-    def _cores_again(self, cores: Sequence[int]) -> set[int]:
-        """The numbers of cores that an adopted job has; what this service was not given it does not count."""
-        taken: set[int] = set()
-        for core in cores:
-            number = next((k for k in sorted(self.free - taken) if self.cores[k] == core), None)
-            taken |= set() if number is None else {number}
-        self.free -= taken
-        return taken
-
 
 def make_directory(directory: Path, job: Job) -> None:
     """The run directory as a runner expects it: the case, and who asked for what."""
@@ -386,13 +335,6 @@ def make_directory(directory: Path, job: Job) -> None:
     submitted = directory / "submitted.json"
     if not submitted.exists():
         write_whole(submitted, job.case.encode(), durable=False)
-    keys = ("seq", "id", "identity", "name", "ranks", "priority", "tags", "time_limit", "created")
+    keys = ("seq", "id", "identity", "name", "ranks", "priority", "tags", "time_limit", "created", "owner", "origin")
     record = {key: getattr(job, key) for key in keys}
     write_json(directory / "job.json", record, durable=False)
-
-
-def process_of(attempt: Attempt) -> Process | None:
-    """The runner of an attempt, as the index has it; None before that was told."""
-    if attempt.pid is None or attempt.pid_start is None or attempt.boot is None:
-        return None
-    return Process(attempt.pid, attempt.pid_start, attempt.boot)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 LONGEST_MESSAGE = 500  # characters
 PATH = re.compile(r"(?<![^\s'\"`(=:,])/(?:[^\s'\"`(),:;/]+/)+(?=[^\s'\"`(),:;/])")  # all but its last name
@@ -124,6 +124,8 @@ class NewJob:
     priority: int = 0
     tags: tuple[str, ...] = ()
     time_limit: float | None = None  # wall-clock seconds of one attempt
+    owner: str | None = None  # the label of the token that made it
+    origin: str | None = None  # the id of the job that this one is a rerun of
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,11 +152,22 @@ class Job:
     core_seconds: float | None  # of all attempts
     result: dict[str, Any]  # scalars of the last history row; `packing`: what was realised
     case: str
+    owner: str | None = None
+    origin: str | None = None
+    bytes: int | None = None  # of its run directory, at the end of its last attempt
 
     @property
     def final(self) -> bool:
         """Whether nothing more happens by itself."""
         return self.state not in (State.QUEUED, State.STARTING, State.RUNNING) and not self.retrying
+
+
+class Waiting(NamedTuple):
+    """A job in the queue."""
+
+    seq: int
+    ranks: int
+    owner: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

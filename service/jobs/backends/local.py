@@ -7,7 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -15,10 +16,12 @@ from typing import Any, NamedTuple
 
 from frit.solver.durable import read_json
 
+from ...settings import own_cores
 from ..launch import kill_marked
 from ..processes import boot, start_of, try_lock
 from ..runner import LOCK, Order, read_exit, run_mark
-from ..states import Exit
+from ..states import Exit, Waiting
+from .protocol import BackendError, FolderError, Handle
 
 LOOK_AGAIN = 0.05  # seconds between two looks at a runner whose process is not known yet
 LOOK_EVERY = 2.0  # seconds between two looks at the folder of a runner that lives
@@ -35,29 +38,90 @@ class Process(NamedTuple):
     boot: str
 
 
-class BackendError(RuntimeError):
-    """No runner was started; the message says why."""
+def choose(queue: Sequence[Waiting], free: int, total: int, overtake: Callable[[int], bool]) -> list[int]:
+    """Which jobs of the queue, by priority and age, get some of the `free` of all `total` cores now.
 
-
-class FolderError(RuntimeError):
-    """The folder of a run is gone, or another stands in its place; a runner may still live."""
-
-    def __init__(self) -> None:
-        super().__init__("its run folder was deleted, moved away or replaced while it had cores")
+    In order, as long as they fit. `overtake` is asked about the first that does not fit: whether smaller ones behind
+    it may go first; if not, cores are kept until they suffice. A job with more ranks than there are cores at all waits
+    for another service and blocks nobody.
+    """
+    chosen: list[int] = []
+    blocked = False
+    for seq, ranks, _ in queue:
+        if ranks <= free:
+            chosen.append(seq)
+            free -= ranks
+        elif ranks <= total and not blocked:
+            blocked = True
+            if not overtake(seq):
+                break
+    return chosen
 
 
 class LocalBackend:
-    """Belongs to one event loop."""
+    """The cores of this process, given to jobs one by one; see `Backend`."""
 
-    def __init__(self) -> None:
+    def __init__(self, cores: int, patience: float = 0.0) -> None:
+        """patience: seconds for which smaller jobs may overtake the first that waits for more cores."""
+        own = own_cores()
+        self.cores = [own[k % len(own)] for k in range(cores)]
+        self.patience = patience
+        self.spare = set(range(cores))  # numbers of self.cores
+        self.held: dict[str, set[int]] = {}  # the same, by job
+        self._first: tuple[int, float] | None = None  # the job that waits for cores, and since when
         self._fork_server: tuple[subprocess.Popen[bytes], socket.socket] | None = None
         self._starting = asyncio.Lock()
 
-    async def start(self, order: Order) -> int:
-        """The pid of a new runner, which holds the lock of its run directory from its first moment on.
+    # --- cores --------------------------------------------------------------------------------------------
 
-        Raises `BackendError`, `FolderError`; then there is no runner.
-        """
+    @property
+    def total(self) -> int:
+        """All cores."""
+        return len(self.cores)
+
+    @property
+    def free(self) -> int:
+        """Cores that no job has."""
+        return len(self.spare)
+
+    def may_start(self, queue: Sequence[Waiting]) -> list[tuple[int, tuple[int, ...]]]:
+        """In order, as far as there are cores; see `choose`."""
+        free, ranks = sorted(self.spare), {job.seq: job.ranks for job in queue}
+        choices = []
+        for seq in choose(queue, len(free), self.total, self._overtake):
+            choices.append((seq, tuple(self.cores[k] for k in free[: ranks[seq]])))
+            free = free[ranks[seq] :]
+        return choices
+
+    def _overtake(self, first: int) -> bool:
+        """Whether the first job that does not fit may be overtaken: for a while since it became the first."""
+        if self._first is None or self._first[0] != first:
+            self._first = (first, time.monotonic())
+        return time.monotonic() - self._first[1] < self.patience
+
+    def hold(self, job: str, ranks: int, cores: Sequence[int]) -> tuple[int, ...]:
+        """Of processors that an earlier service gave, those that this one has not do not count."""
+        taken: set[int] = set()
+        for core in cores:
+            number = next((k for k in sorted(self.spare - taken) if self.cores[k] == core), None)
+            taken |= set() if number is None else {number}
+        self.spare -= taken
+        self.held[job] = taken
+        return tuple(self.cores[k] for k in sorted(taken))
+
+    def release(self, job: str) -> None:
+        """They are spare again."""
+        self.spare |= self.held.pop(job, set())
+
+    # --- runners ------------------------------------------------------------------------------------------
+
+    async def start(self, order: Order) -> Handle | None:
+        """A new runner, which holds the lock of its run directory from its first moment on."""
+        pid = await self._start(order)
+        started = start_of(pid)
+        return None if started is None else Process(pid, started, boot())._asdict()
+
+    async def _start(self, order: Order) -> int:
         try:
             lock = try_lock(Path(order.directory) / LOCK)
         except GONE as error:
@@ -84,29 +148,22 @@ class LocalBackend:
             raise EOFError("it has died")
         return int(answer)
 
-    async def recorded(self, directory: Path, attempt: int) -> dict[str, Any] | None:
-        """Wait until the attempt's runner has recorded itself; the record, None where it ended before.
-
-        Raises `FolderError`.
-        """
+    async def find(self, directory: Path, attempt: int) -> Handle | None:
+        """By the record that it writes; None where it ended before."""
         while (record := read_json(directory / "attempt.json")).get("attempt") != attempt:
             if (lock := lock_again(directory)) is not None:
                 os.close(lock)
                 return None
             await asyncio.sleep(LOOK_AGAIN)
-        return record
+        return recorded(record)._asdict()
 
     async def ended(
-        self, directory: Path, attempt: int, pid: int | None = None, seen: Callable[[], None] = lambda: None
+        self, directory: Path, attempt: int, handle: Handle | None = None, alive: Callable[[], None] = lambda: None
     ) -> Exit | None:
-        """Wait for the end of the attempt's runner; its exit record, None where it left none.
-
-        pid: the process that `start` has just told of; seen: called after every look at a runner that lives. Raises
-        `FolderError`, within seconds after the folder has gone.
-        """
-        process = None if pid is None else opened(pid)
+        """It has ended when its lock is free. Raises `FolderError` within seconds after the folder has gone."""
+        process = None if handle is None else opened_again(Process(**handle))
         while (lock := lock_again(directory)) is None:  # it lives, and so the pid was not reused
-            seen()
+            alive()
             if process is None:
                 process = runner_of(directory, attempt)
             if process is not None:
@@ -124,9 +181,9 @@ class LocalBackend:
             raise FolderError  # this is a copy, in which nobody runs
         return read_exit(directory, attempt)
 
-    async def clear(self, directory: Path, runner: Process | None) -> None:
-        """Kill the runner, and all that runners have started in a folder that may be gone."""
-        if runner is not None and (process := opened_again(runner)) is not None:
+    async def clear(self, directory: Path, handle: Handle | None) -> None:
+        """Kill it, and all that carries the mark of the folder."""
+        if handle is not None and (process := opened_again(Process(**handle))) is not None:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(process, signal.SIGKILL)
             if (process := await gone(process, CLEARING)) is not None:
@@ -137,7 +194,7 @@ class LocalBackend:
             await asyncio.sleep(LOOK_AGAIN)
 
     def tell(self, directory: Path, attempt: int, number: signal.Signals) -> None:
-        """Send the attempt's runner a signal, if it lives; a reused pid is never hit."""
+        """A reused pid is never hit."""
         if (process := runner_of(directory, attempt)) is not None:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(process, number)
@@ -169,7 +226,12 @@ def runner_of(directory: Path, attempt: int) -> int | None:
     record = read_json(directory / "attempt.json")
     if record.get("attempt") != attempt:
         return None
-    return opened_again(Process(record["pid"], record["pid_start"], record["boot"]))
+    return opened_again(recorded(record))
+
+
+def recorded(record: Mapping[str, Any]) -> Process:
+    """Who a runner says it is."""
+    return Process(record["pid"], record["pid_start"], record["boot"])
 
 
 def opened_again(runner: Process) -> int | None:

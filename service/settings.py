@@ -81,6 +81,19 @@ class Settings(BaseSettings):
     conversions: AtLeastOne = 2
     """requests whose files are read at the same time"""
 
+    file_limit: AtLeastOne = 500_000_000
+    """bytes of a file that is uploaded by itself, at most"""
+    private: bool = False
+    """jobs, sweeps and files are seen by the token that made them and by tokens of scope admin only"""
+    quota_queued: AtLeastOne | None = None
+    """jobs of a token that wait in the queue, at most"""
+    quota_cores: AtLeastOne | None = None
+    """cores that the jobs of a token have at once, at most"""
+    quota_core_hours: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    """core-hours that the jobs of a token have taken, also those that are deleted, above which it submits no more"""
+    quota_bytes: AtLeastOne | None = None
+    """bytes that run directories and files of a token take, above which it submits no more"""
+
     @property
     def runs(self) -> Path:
         """Parent of the run directories."""

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 from frit.service.cli import token as commands_token
 from frit.service.http.app import create_app
+from frit.service.http.security import check
 from frit.service.index import tokens
 from frit.service.index.reindex import rebuild
-from frit.service.jobs.engine import check
 from frit.service.settings import Settings
 
 JOB = {"case": TINY}

@@ -50,9 +50,9 @@ def serve(
     from pydantic import ValidationError
 
     from ..http.app import create_app
-    from ..http.security import AddressError
+    from ..http.security import AddressError, check
     from ..http.wire import options
-    from ..jobs.engine import EngineError, check
+    from ..jobs.engine import EngineError
     from ..jobs.memory import keep_little
     from ..settings import Settings
 

@@ -1,39 +1,46 @@
 """What may come in: uploaded files, paths that name them, and sizes that this service can bear."""
 
+import asyncio
 import json
-import math
 import os
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import AsyncIterator, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from frit.solver.case import Case, CaseError, Particles, Problem, Table, parse_case
 from frit.solver.variations import Texts, case_text, identity, written
 from frit.sweeps.definition import parse_sweep
-from frit.sweeps.expand import expand
+from frit.sweeps.expand import Expansion, expand
 
-from ..index.records import NewPoint
+from ..index.records import Key, NewPoint, SweepRecord
 from ..index.store import Store
-from ..jobs.states import NewJob, State
+from ..jobs.states import NewJob
 from ..settings import Settings
 from .problems import HttpError, WrongField, escaped, pointer_to, refused, refused_case, shown
 from .reckoning import Excess, excesses, too_long
+from .security import Who
+from .stored import Stored
 from .uploads import Uploads
 from .views import FileContent, JobSubmission, SweepSubmission
 
+if TYPE_CHECKING:
+    from .asking import Rooms
+
 NONE = Uploads()
-QUEUE_COUNT = 1.0  # seconds for which a count of the queue holds
 DEPTH = 6  # of tables in a case or sweep, more than there are
 Tree = dict[str, Any]
 
 
-def job_of(submission: JobSubmission, settings: Settings, uploads: Uploads = NONE) -> NewJob:
+def job_of(
+    submission: JobSubmission, settings: Settings, uploads: Uploads = NONE, owner: str | None = None
+) -> NewJob:
     """The job that a request asks for, with its files where they are kept. Raises `HttpError`."""
     check_ranks(submission.ranks, settings, "/ranks")
-    check_paths(submission.case, submission.files, "/case")
+    check_paths(submission.case, uploads.paths or submission.files, "/case")
     refuse_excesses(too_long(submission.case.get("particles"), settings), "/case")
     tree = _replaced(submission.case, uploads.paths) if uploads.paths else dict(submission.case)
     try:
@@ -47,7 +54,7 @@ def job_of(submission: JobSubmission, settings: Settings, uploads: Uploads = NON
     return NewJob(
         case=text, identity=identity(texts), ranks=submission.ranks,
         priority=submission.priority, tags=tuple(submission.tags), time_limit=submission.time_limit,
-        name=case.name if submission.name is None else submission.name,
+        owner=owner, name=case.name if submission.name is None else submission.name,
     )  # fmt: skip
 
 
@@ -79,12 +86,21 @@ class NewSweep:
     name: str
     definition: str
     points: Sequence[NewPoint]
-    duplicates: int
+    expansion: Expansion
+    owner: str | None
+
+    def queued(self, store: Store, key: Key | None, shared: bool) -> "Future[SweepRecord]":
+        """Queue what is missing of it; shared: whether others' jobs of the same case count."""
+        return store.submit_sweep(
+            self.name, self.definition, self.points, self.expansion.duplicates, key, self.owner, shared
+        )
 
 
-def sweep_of(submission: SweepSubmission, settings: Settings, uploads: Uploads = NONE) -> NewSweep:
+def sweep_of(
+    submission: SweepSubmission, settings: Settings, uploads: Uploads = NONE, owner: str | None = None
+) -> NewSweep:
     """The sweep that a request asks for, with all its points. Takes seconds for many. Raises `HttpError`."""
-    check_paths(submission.definition, submission.files, "/definition")
+    check_paths(submission.definition, uploads.paths or submission.files, "/definition")
     refuse_excesses(_long_lists(submission.definition, settings), "/definition")
     given = submission.model_dump(include={"ranks", "name", "priority", "tags"}, exclude_none=True)
     tree = {**submission.definition, **given}
@@ -104,10 +120,10 @@ def sweep_of(submission: SweepSubmission, settings: Settings, uploads: Uploads =
         refuse_excesses(excesses(case, sweep.ranks, settings), "/definition", point.name)
         job = NewJob(
             case=point.case, identity=point.identity, name=point.name, ranks=sweep.ranks, priority=sweep.priority,
-            tags=tuple(sweep.tags), time_limit=submission.time_limit,
+            tags=tuple(sweep.tags), time_limit=submission.time_limit, owner=owner,
         )  # fmt: skip
         points.append(NewPoint(job, point.parameters))
-    return NewSweep(sweep.name, sweep.resolved_json(), points, expansion.duplicates)
+    return NewSweep(sweep.name, sweep.resolved_json(), points, expansion, owner)
 
 
 def _long_lists(definition: Mapping[str, Any], settings: Settings) -> Iterator[Excess]:
@@ -152,30 +168,32 @@ def over_limit(*wrong: WrongField) -> HttpError:
     return refused("over-limit", "More than this service allows", wrong)
 
 
-@dataclass
-class QueueLimit:
-    """Counts the queue at most once a second and what came in since; so it never lets in too many."""
-
-    store: Store
-    limit: int
-    queued: int = 0
-    counted: float = field(default=-math.inf)
-
-    def admit(self, jobs: int) -> None:
-        """Raises `HttpError` where the queue is full."""
-        if (now := time.monotonic()) > self.counted + QUEUE_COUNT:
-            self.queued, self.counted = self.store.count(State.QUEUED), now
-        if self.queued + jobs > self.limit:
-            detail = f"{self.queued} jobs are queued and {jobs} more came, must be at most {self.limit} together"
-            raise HttpError(429, "queue-full", "The queue is full", detail, headers={"Retry-After": "30"})
-        self.queued += jobs
-
-
 # --- files ------------------------------------------------------------------------------------------------
 
 
-def check_paths(tree: Mapping[str, Any], files: Mapping[str, FileContent], pointer: str) -> None:
-    """Raises `HttpError` for a path that is not the name of a file that came along."""
+def needs_files(tree: Mapping[str, Any], files: Collection[str]) -> bool:
+    """Whether a case brings files, or names any."""
+    return bool(files) or next(_paths(tree), None) is not None
+
+
+@asynccontextmanager
+async def taken(
+    tree: Mapping[str, Any], files: Mapping[str, FileContent], pointer: str, rooms: "Rooms", who: Who
+) -> AsyncIterator[Uploads]:
+    """The files that came along with a case or sweep, and those that it names by their ids. Raises `HttpError`."""
+    stored = await asyncio.to_thread(stored_in, tree, files, rooms.stored, who)
+    await asyncio.to_thread(check_paths, tree, [*files, *stored], pointer)
+    async with rooms.shelf.taken(files, stored) as uploads:
+        yield uploads
+
+
+def stored_in(tree: Mapping[str, Any], files: Collection[str], stored: Stored, who: Who) -> dict[str, str]:
+    """Where the files are that a case or sweep names by their ids, having been uploaded before."""
+    return stored.paths({value for _, value in _paths(tree) if value not in files}, who.sees)
+
+
+def check_paths(tree: Mapping[str, Any], files: Collection[str], pointer: str) -> None:
+    """Raises `HttpError` for a path that is not the name of a file that came along, or came before."""
     if wrong := [
         WrongField(pointer=pointer + place, value=shown(value), detail=_allowed(files))
         for place, value in _paths(tree)
@@ -184,9 +202,9 @@ def check_paths(tree: Mapping[str, Any], files: Mapping[str, FileContent], point
         raise refused("refused-path", "A path is refused", wrong)
 
 
-def _allowed(files: Mapping[str, FileContent]) -> str:
+def _allowed(files: Collection[str]) -> str:
     known = f": {', '.join(map(repr, files))}" if files else ", and there are none"
-    return f"must be the name of an uploaded file, a key of `files`{known}"
+    return f"must be the name of an uploaded file, a key of `files`{known}; or the id of one that was uploaded before"
 
 
 def _paths(tree: Any, key: str = "", place: str = "") -> Iterator[tuple[str, str]]:

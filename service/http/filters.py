@@ -41,7 +41,7 @@ COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
 INDEXED = ("particles.mean_radius", "particles.std_radius", "particles.packing_density", "result.vacancy_ratio")
 RESULTS = ("time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "particles", "evaluations",
            "wall_time", "neck_length", "centre_distance")  # fmt: skip
-NATIVE = (*INDEXED, "id", "identity", "name", "state")  # what the schema has an index of
+NATIVE = (*INDEXED, "id", "identity", "name", "state", "owner")  # what the schema has an index of
 PACKING = re.compile(r"result\.packing(\.[A-Za-z_][A-Za-z0-9_]*){1,3}")
 
 
@@ -92,7 +92,7 @@ def columns() -> dict[str, Scalar]:
     kinds = {
         "id": "string", "name": "string", "identity": "string", "state": "string", "priority": "integer",
         "ranks": "integer", "attempt": "integer", "created": "time", "started": "time", "ended": "time",
-        "core_seconds": "number",
+        "core_seconds": "number", "bytes": "integer", "owner": "string", "origin": "string",
     }  # fmt: skip
     return {key: Scalar(key, kind, jobs.c[key]) for key, kind in kinds.items()}
 
@@ -153,10 +153,15 @@ def native(scalar: Scalar) -> bool:
     return scalar.key in NATIVE
 
 
-def select(parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int]) -> Selection:
-    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpError`."""
+def select(
+    parameters: Iterable[tuple[str, str]], sweep: Callable[[str], int], owner: str | None = None
+) -> Selection:
+    """What the query parameters ask for; `sweep` gives the seq of a sweep. Raises `HttpError`.
+
+    owner: whose jobs are seen; None: everybody's.
+    """
     wrong: list[WrongField] = []
-    where: list[Condition] = []
+    where: list[Condition] = [] if owner is None else [jobs.c.owner == owner]
     given: dict[str, list[str]] = {}
     for name, value in parameters:
         given.setdefault(name, []).append(value)

@@ -24,7 +24,7 @@ TITLES = {
     404: "There is no such thing",
     409: "The job's state does not allow it",
     413: "The body is too large",
-    415: "The body must be JSON",
+    415: "The body is of the wrong kind",
     416: "There is nothing in this range",
     421: "The service does not answer to this host name",
     422: "The request is refused",
@@ -95,6 +95,14 @@ def file(media_type: str) -> Responses:
         304: {"description": "Unchanged: If-None-Match has its tag"},
         **problems(416, *READING),
     }
+
+
+OCTETS = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
 
 
 def _filters() -> dict[str, Any]:

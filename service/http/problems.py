@@ -18,6 +18,7 @@ from starlette.routing import BaseRoute
 from frit.solver.case import CaseError
 
 from ..index.records import KeyReusedError, NotFoundError, StoreError
+from ..index.removals import InUseError
 from ..jobs.states import TransitionError
 
 MEDIA_TYPE = "application/problem+json"
@@ -186,7 +187,7 @@ def handle_problems(app: FastAPI, routes: Sequence[BaseRoute]) -> None:
             problem.headers["Allow"] = ", ".join(sorted(methods))
         return problem.response()
 
-    kinds = (HttpError, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError)
+    kinds = (HttpError, RequestValidationError, HTTPException, StoreError, NotFoundError, KeyReusedError, InUseError)
     for kind in (*kinds, TransitionError, Exception):
         app.add_exception_handler(kind, problem)
 
@@ -206,6 +207,8 @@ def as_problem(error: Exception) -> HttpError:
     if isinstance(error, KeyReusedError):
         field = WrongField(parameter="Idempotency-Key", detail=str(error))
         return HttpError(422, "key-reused", "The key came before, with another request", str(error), [field])
+    if isinstance(error, InUseError):
+        return HttpError(409, "in-use", "It is in use", str(error))
     if isinstance(error, TransitionError):
         title = "The job's state does not allow this"
         return HttpError(409, "wrong-state", title, str(error), state=str(error.state))

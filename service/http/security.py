@@ -6,7 +6,9 @@ rebinding), and a page of another origin cannot POST. The first token ends that 
 """
 
 import ipaddress
+import os
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -15,9 +17,11 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ..index.migrations import IndexVersionError
 from ..index.records import StoreError, Token
 from ..index.store import Store
 from ..index.tokens import allows, digest, is_marked, set_mark
+from ..jobs.engine import EngineError, take
 from ..settings import Settings
 from .problems import HttpError, as_problem
 
@@ -25,6 +29,7 @@ LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 WHO = "frit.token"  # of a request's scope: the token it was let in by; None: it needed none
 AGAIN = "frit.again"  # of a request's scope: asks anew whether it is let in
 READING = ("GET", "HEAD", "OPTIONS")
+FILES = "/v1/files"  # takes files as they are
 OPEN = ("/livez", "/readyz")  # they tell nothing: health checks need neither token nor name
 DOCUMENTS = ("/docs", "/openapi.json", "/redoc")  # the same for every service of this version: no token
 
@@ -65,6 +70,21 @@ def check_address(settings: Settings, store: Store) -> str | None:
     return None
 
 
+def check(settings: Settings) -> str | None:
+    """Say early why a service cannot be started, or answers nobody. Raises `EngineError`, `AddressError`."""
+    lock = take(settings.data)
+    try:
+        store = Store(settings.data)
+        try:
+            return check_address(settings, store)
+        finally:
+            store.close()
+    except (IndexVersionError, StoreError) as error:
+        raise EngineError(str(error)) from error
+    finally:
+        os.close(lock)
+
+
 class Door:
     """Whether requests are answered without a token. Once shut it stays shut."""
 
@@ -103,10 +123,10 @@ class Gate:
                     answer.headers["Connection"] = "close"
                 await answer(scope, receive, send)
                 return
-            receive = self._counted(receive)
+            receive = self._counted(receive, body_limit(scope["path"], self.settings))
         await self.app(scope, receive, send)
 
-    def _counted(self, receive: Receive) -> Receive:
+    def _counted(self, receive: Receive, most: int) -> Receive:
         """A body without a Content-Length, or with a wrong one, ends where it becomes too large."""
         came = 0
 
@@ -114,8 +134,8 @@ class Gate:
             nonlocal came
             message = await receive()
             came += len(message.get("body", b""))
-            if came > self.settings.body_limit:
-                raise HTTPException(413, f"more than {self.settings.body_limit} bytes came")  # passes through the route
+            if came > most:
+                raise HTTPException(413, f"more than {most} bytes came")  # passes through the route
             return message
 
         return counted
@@ -126,7 +146,7 @@ class Gate:
             scope[WHO] = self.admitted(scope, headers)
             scope[AGAIN] = lambda: self.admitted(scope, headers)
         if not reads:
-            self._check_body(headers)
+            check_body(headers, scope["path"], body_limit(scope["path"], self.settings))
 
     def admitted(self, scope: Scope, headers: Headers) -> Token | None:
         """The token that a request came in by, None where it needs none. Raises `HttpError` for all others."""
@@ -144,16 +164,23 @@ class Gate:
         check_scope(token, "read" if reads else "submit")
         return token
 
-    def _check_body(self, headers: Headers) -> None:
-        length, kind = headers.get("content-length", "0"), headers.get("content-type")
-        chunked = "transfer-encoding" in headers
-        if length.isdigit() and int(length) > self.settings.body_limit:
-            raise HTTPException(413, f"{length} bytes, must be at most {self.settings.body_limit}")
-        if kind is None and length == "0" and not chunked:
-            return
-        if (kind or "").partition(";")[0].strip().lower() != "application/json":
-            detail = f"Content-Type = {kind!r}: must be application/json"
-            raise HttpError(415, "unsupported-media-type", "The body must be JSON", detail)
+
+def body_limit(path: str, settings: Settings) -> int:
+    """Bytes of a body, at most."""
+    return settings.file_limit if path == FILES else settings.body_limit
+
+
+def check_body(headers: Headers, path: str, most: int) -> None:
+    """Refuse a body that is too large, or of another kind."""
+    length, kind = headers.get("content-length", "0"), headers.get("content-type")
+    if length.isdigit() and int(length) > most:
+        raise HTTPException(413, f"{length} bytes, must be at most {most}")
+    if kind is None and length == "0" and "transfer-encoding" not in headers:
+        return
+    wanted = "application/octet-stream" if path == FILES else "application/json"
+    if (kind or "").partition(";")[0].strip().lower() != wanted:
+        detail = f"Content-Type = {kind!r}: must be {wanted}"
+        raise HttpError(415, "unsupported-media-type", "The body is of the wrong kind", detail)
 
 
 def bearer(headers: Headers, active: Mapping[str, Token]) -> Token:
@@ -226,18 +253,51 @@ def still_admitted(request: Request) -> bool:
     return True
 
 
-def needs(scope: str) -> Callable[..., Awaitable[str]]:
-    """A dependency that gives the name of the token, "-" where none was needed and so there are no names."""
+@dataclass(frozen=True)
+class Who:
+    """Who asks: the label of the token, None where none was needed and so there are no labels."""
 
-    async def check(request: Request) -> str:
-        token: Token | None = request.scope[WHO]
+    label: str | None
+    admin: bool
+    private: bool  # whether this service shows everybody only what is their own
+
+    @property
+    def name(self) -> str:
+        """Keeps the idempotency keys of one apart from another's."""
+        return self.label or "-"
+
+    @property
+    def only(self) -> str | None:
+        """The owner whose things are all that is seen; None: everybody's."""
+        return self.label if self.private and not self.admin else None
+
+    def may(self, owner: str | None) -> bool:
+        """Whether this one may change what that one has made; what was made without a token is everybody's."""
+        return self.admin or owner is None or owner == self.label
+
+    def sees(self, owner: str | None) -> bool:
+        """Whether this one may look at it."""
+        return self.only is None or owner == self.label
+
+    def check(self, owner: str | None, what: str) -> None:
+        """Refuse to change what is another's."""
+        if not self.may(owner):
+            detail = f"{what}: belongs to {owner!r}; only that token and those of scope admin may change it"
+            raise HttpError(403, "not-yours", "It belongs to somebody else", detail)
+
+
+def needs(scope: str) -> Callable[..., Awaitable[Who]]:
+    """A dependency that gives who asks."""
+
+    async def check(request: Request) -> Who:
+        token, private = request.scope[WHO], request.app.state.settings.private
         if token is None:
-            return "-"
+            return Who(None, True, private)
         check_scope(token, scope)
-        return token.name
+        return Who(token.name, token.scope == "admin", private)
 
     return check
 
 
-Reader = Annotated[str, Depends(needs("read"))]
-Submitter = Annotated[str, Depends(needs("submit"))]
+Reader = Annotated[Who, Depends(needs("read"))]
+Submitter = Annotated[Who, Depends(needs("submit"))]

@@ -14,7 +14,7 @@ from fastapi.sse import ServerSentEvent
 
 from ..index.records import NotFoundError, StoreError
 from ..jobs.engine import Engine
-from .views import moment, without_path
+from .shown import moment, without_path
 
 PATIENCE = 2.0  # seconds between two looks when nothing is notified
 PAUSE = 0.05  # seconds between two looks, at least
@@ -67,6 +67,37 @@ async def events(
             yield ServerSentEvent(event="progress", data=progress)
         await engine.notifier.wait(PATIENCE)
         await anyio.sleep(max(0.0, looked + PAUSE - time.monotonic()))
+
+
+async def all_events(
+    engine: Engine, last_event_id: str | None, since: int | None, owner: str | None, admitted: Callable[[], bool]
+) -> AsyncIterator[ServerSentEvent]:
+    """`state` and `deleted` of all jobs, or of an owner's; the id is the number of the event."""
+    store, hidden = engine.store, str(engine.settings.data.absolute())
+    known = re.fullmatch(r"\d{1,18}", last_event_id or "")
+    last = int(known[0]) if known else since
+    if last is None:
+        last = store.last_event()
+        yield ServerSentEvent(event="begin", data={}, id=str(last))
+    while True:
+        looked = time.monotonic()
+        async with engine.notifier.turn():
+            if not admitted():
+                return
+            try:
+                news = store.news(last, ROWS, owner)
+            except StoreError:  # the client comes back
+                return
+        for each in news:
+            last, gone = each.seq, each.state in ("job", "sweep")
+            data = {"at": moment(each.at).isoformat().replace("+00:00", "Z")}
+            more = {each.state: each.id} if gone else {
+                "job": each.id, "name": each.name, "state": each.state, "message": without_path(each.message, hidden)
+            }  # fmt: skip
+            yield ServerSentEvent(event="deleted" if gone else "state", data={**data, **more}, id=str(last))
+        if len(news) < ROWS:
+            await engine.notifier.wait(PATIENCE)
+            await anyio.sleep(max(0.0, looked + PAUSE - time.monotonic()))
 
 
 def _state(change: Any, rows: int, hidden: str) -> ServerSentEvent:

@@ -20,11 +20,12 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from frit.solver.case import CaseError, Problem
 from frit.solver.durable import replace_durably, write_new
@@ -32,7 +33,7 @@ from frit.solver.mesh_file import SUFFIX
 
 from ..settings import Settings
 from .problems import HttpError, WrongField, escaped, refused, shown, unavailable
-from .sniffing import PARTICLES, UnknownFileError, kind_of
+from .sniffing import PARTICLES, Content, UnknownFileError, kind_of
 from .views import FileContent
 
 SUFFIXES = (".msh", ".vtk", ".vtu", ".mesh", ".su2", ".csv", ".cloud")
@@ -41,6 +42,7 @@ LONGEST_LINE = 1000  # bytes of a line of particles
 SPARE_LINES = 1000  # of comments, beside one per particle
 UNUSED = 86_400.0  # seconds after which a file that nothing uses is removed
 BESIDE = ".new-"  # what a folder of unfinished work begins with
+T = TypeVar("T")
 SAID = 200  # characters that are told of what a reader says
 
 
@@ -77,24 +79,28 @@ class Shelf:
         self._pool.shutdown(cancel_futures=True)
 
     @asynccontextmanager
-    async def taken(self, files: Mapping[str, FileContent]) -> AsyncIterator[Uploads]:
-        """The files, kept from the end of the block on unless it raises. Raises `HttpError` for what is not taken."""
-        if not files:
+    async def taken(
+        self, files: Mapping[str, FileContent], stored: Mapping[str, str] | None = None
+    ) -> AsyncIterator[Uploads]:
+        """The files, kept from the end of the block on unless it raises. Raises `HttpError` for what is not taken.
+
+        stored: paths of files that are here already, by the names that the request has for them.
+        """
+        if not files and not stored:
             yield Uploads()
             return
-        if self._waiting >= WAITING:
-            raise unavailable("too many uploads wait to be read")
-        self._waiting += 1
+        held, accepted = self.hold((stored or {}).values()), False
         try:
-            paths = await asyncio.get_running_loop().run_in_executor(self._pool, self.take, files)
+            if len(held) < len(stored or {}):
+                raise refused("refused-path", "A path is refused", [WrongField(detail="a file was removed meanwhile")])
+            paths = await self.aside(lambda: self.take(files)) if files else {}
+            try:
+                yield Uploads({**(stored or {}), **paths})
+                accepted = True
+            finally:
+                self.release(paths.values(), accepted)
         finally:
-            self._waiting -= 1
-        accepted = False
-        try:
-            yield Uploads(paths)
-            accepted = True
-        finally:
-            self.release(paths.values(), accepted)
+            self.release(held, accepted=True)
 
     @contextmanager
     def holding(self, files: Mapping[str, FileContent]) -> Iterator[Uploads]:
@@ -109,39 +115,59 @@ class Shelf:
     def take(self, files: Mapping[str, FileContent]) -> dict[str, str]:
         """Read, convert and hold the files: paths by name, to be released. Raises `HttpError`."""
         contents = {name: content_of(name, file) for name, file in files.items()}
-        kinds = {name: self._kind(name, content) for name, content in contents.items()}
+        kinds = {name: self.kind(name, content) for name, content in contents.items()}
         if not files:
             return {}
         self.folder.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=BESIDE, dir=self.folder))
         try:
-            meshes = {name: content for name, content in contents.items() if kinds[name] != PARTICLES}
-            made = convert(meshes, kinds, work, self.settings) if meshes else {}
-            for name in contents.keys() - meshes.keys():
-                made[name] = work / f"{len(made)}.csv"
-                write_new(made[name], contents[name])
-            return {name: str(self._place(made[name])) for name in files}
+            sources = {name: work / f"{number}.in" for number, name in enumerate(contents)}
+            for name, source in sources.items():
+                write_new(source, contents[name])
+            return self.placed(sources, kinds, work)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
-    def _kind(self, name: str, content: bytes) -> str:
+    async def aside(self, work: Callable[[], T]) -> T:
+        """Have it done where files are read. Raises `HttpError` where too many wait for that."""
+        if self._waiting >= WAITING:
+            raise unavailable("too many uploads wait to be read")
+        self._waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._pool, work)
+        finally:
+            self._waiting -= 1
+
+    def kind(self, name: str, content: Content) -> str:
+        """What a file is. Raises `HttpError` for one that is not taken."""
         try:
             kind = kind_of(content)
         except UnknownFileError as error:
             raise not_taken(name, str(error)) from None
         if kind == PARTICLES:
-            text = content.rstrip(b"\r\n")
-            lines = text.count(b"\n") + text.count(b"\r") - text.count(b"\r\n") + 1
             most = self.settings.particles_limit
+            if len(content) > (most + SPARE_LINES) * LONGEST_LINE:
+                raise not_taken(name, f"has {len(content)} bytes, too many for {most} particles")
+            text = content[:].rstrip(b"\r\n")
+            lines = text.count(b"\n") + text.count(b"\r") - text.count(b"\r\n") + 1
             if lines > most + SPARE_LINES:
                 raise not_taken(name, f"has {lines} lines, must be at most {most} particles")
-            if max(map(len, content.splitlines()), default=0) > LONGEST_LINE:
+            if max(map(len, text.splitlines()), default=0) > LONGEST_LINE:
                 raise not_taken(name, f"has a line longer than {LONGEST_LINE} bytes")
         return kind
 
+    def placed(self, sources: Mapping[str, Path], kinds: Mapping[str, str], work: Path) -> dict[str, str]:
+        """Have meshes converted, and hold all under the hash of what they are now: paths by name, to be released."""
+        meshes = {name: source for name, source in sources.items() if kinds[name] != PARTICLES}
+        made = convert(meshes, kinds, work, self.settings) if meshes else {}
+        for name in sources.keys() - meshes.keys():
+            made[name] = sources[name].rename(sources[name].with_suffix(".csv"))
+        return {name: str(self._place(made[name])) for name in sources}
+
     def _place(self, made: Path) -> Path:
         """Move a finished file to its name, once for each content, and hold it."""
-        digest = hashlib.sha256(made.read_bytes()).hexdigest()
+        with open(made, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
         path = self.folder / f"{digest}{made.suffix}"
         with self._door:
             if path.exists():
@@ -151,6 +177,21 @@ class Shelf:
                 self._fresh.add(str(path))
             self._held[str(path)] += 1
         return path
+
+    def hold(self, paths: Iterable[str]) -> list[str]:
+        """Keep files that are there from being removed, until they are released; those that are there."""
+        with self._door:
+            found = [path for path in paths if os.path.exists(path)]
+            self._held.update(found)
+        return found
+
+    def discard(self, path: Path) -> bool:
+        """Remove a file, unless a request under way uses it."""
+        with self._door:
+            if self._held[str(path)]:
+                return False
+            path.unlink(missing_ok=True)
+        return True
 
     def release(self, paths: Iterable[str], accepted: bool) -> None:
         """A request under way is over; what it alone brought is removed unless it was accepted."""
@@ -169,6 +210,8 @@ class Shelf:
     def tidy(self, used: Iterable[str], age: float = UNUSED) -> list[str]:
         """Remove files that are older than that and not among the used, by name; the names of what was removed."""
         kept, removed, before = set(used), [], time.time() - age
+        cards = {path.name for path in self.folder.glob("*.card")}  # of files that were uploaded by themselves
+        kept |= cards | {name.removesuffix(".card") for name in cards}
         with suppress(FileNotFoundError), os.scandir(self.folder) as entries:
             for entry in entries:
                 with self._door, suppress(FileNotFoundError):
@@ -183,11 +226,16 @@ class Shelf:
         return removed
 
 
-def content_of(name: str, file: FileContent) -> bytes:
-    """The file's bytes. Raises `HttpError`."""
+def check_suffix(name: str) -> None:
+    """Raises `HttpError` for a name that is not of a mesh or of particles."""
     suffix = re.sub(r"^.*(?=\.)", "", name, flags=re.DOTALL).lower()
     if suffix not in SUFFIXES:
         raise not_taken(name, f"must end in one of {', '.join(SUFFIXES)}", shown(name))
+
+
+def content_of(name: str, file: FileContent) -> bytes:
+    """The file's bytes. Raises `HttpError`."""
+    check_suffix(name)
     try:
         return file.content.encode() if file.encoding == "text" else base64.b64decode(file.content, validate=True)
     except (binascii.Error, ValueError):
@@ -200,13 +248,10 @@ def not_taken(name: str, why: str, value: object = None, pointer: str = "") -> H
     return refused("refused-file", "A file is refused", [wrong])
 
 
-def convert(contents: Mapping[str, bytes], kinds: Mapping[str, str], work: Path, settings: Settings) -> dict[str, Path]:
-    """frit's own mesh files for the files of a request, in the folder. Raises `HttpError`."""
-    names = list(contents)
-    tasks = []
-    for number, name in enumerate(names):
-        write_new(work / f"{number}.in", contents[name])
-        tasks.append([f"{number}.in", kinds[name], f"{number}{SUFFIX}"])
+def convert(sources: Mapping[str, Path], kinds: Mapping[str, str], work: Path, settings: Settings) -> dict[str, Path]:
+    """frit's own mesh files for meshes in the folder, there as well. Raises `HttpError`."""
+    names = list(sources)
+    tasks = [[source.name, kinds[name], f"{source.stem}{SUFFIX}"] for name, source in sources.items()]
     answers = ask_child(tasks, work, settings)
     if len(answers) < len(names):
         limits = f"{settings.upload_seconds:g} s or the {settings.upload_memory:.3g} bytes of memory"

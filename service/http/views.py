@@ -1,16 +1,13 @@
-"""What travels over HTTP: the bodies of requests and of responses. Times are ISO 8601 in UTC."""
+"""What travels over HTTP: the bodies of requests and of answers. Times are ISO 8601 in UTC."""
 
-import json
-from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from frit.solver.characters import HIDDEN
 
-from ..index.records import Attempt, SweepRecord
-from ..jobs.states import Job, State
+from ..jobs.states import State
 
 EXAMPLE_CASE: dict[str, Any] = {
     "name": "two equal discs",
@@ -89,6 +86,65 @@ class SweepSubmission(Body):
     files: Files = {}
 
 
+class JobChanges(Body):
+    """What is to be different about a job; what is not given stays."""
+
+    name: Text | None = None
+    priority: Priority | None = None
+    tags: Tags | None = None
+
+
+class PlanRequest(Body):
+    """A case, or the definition of a sweep."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"case": EXAMPLE_CASE}, {"definition": EXAMPLE_SWEEP}]})
+
+    case: dict[str, Any] | None = None
+    definition: dict[str, Any] | None = None
+    ranks: Ranks | None = None
+    files: Files = {}
+
+
+class Need(BaseModel):
+    """What one case will need, as it is reckoned before it is built."""
+
+    nodes: float
+    points: float
+    particles: float
+    memory_bytes: float
+    disk_bytes: float
+
+
+class Plan(BaseModel):
+    """What a case or sweep would cost. `busy`: by ranks, the part of their time that is work."""
+
+    points: int
+    duplicates: int
+    done: int
+    to_run: int
+    core_hours: float
+    source: str
+    busy: dict[str, float]
+    need: Need | None
+
+
+class FileView(BaseModel):
+    """A file that was uploaded by itself; `bytes` of what is kept of it: meshes are converted."""
+
+    id: str
+    name: str
+    owner: str | None
+    bytes: int
+    created: datetime
+
+
+class FilePage(BaseModel):
+    """Some files; `next` is the address of the files after them."""
+
+    files: list[FileView]
+    next: str | None
+
+
 class AttemptView(BaseModel):
     """One try at a job."""
 
@@ -120,6 +176,9 @@ class JobSummary(BaseModel):
     started: datetime | None
     ended: datetime | None
     core_seconds: float | None
+    bytes: int | None
+    owner: str | None
+    origin: str | None
     parameters: dict[str, Any]
     result: dict[str, Any]
     links: dict[str, str]
@@ -160,6 +219,7 @@ class SweepView(BaseModel):
     id: str
     name: str
     created: datetime
+    owner: str | None
     points: int
     duplicates: int
     new: int
@@ -194,20 +254,30 @@ class Curve(BaseModel):
 
 
 class Comparison(BaseModel):
-    """An observable of all jobs of a sweep."""
+    """An observable of jobs of a sweep; `next` is the address of those after them."""
 
     sweep: str
     observable: str
     differing: list[str]
     curves: list[Curve]
+    next: str | None
+
+
+class Quota(BaseModel):
+    """What a token may have (None: as much as it likes), has, and has left."""
+
+    used: float
+    limit: float | None
+    left: float | None
 
 
 class Limits(BaseModel):
-    """What this service allows, and its states in words."""
+    """What this service allows, the quotas of the token that asks, and the states in words."""
 
     cores: int
     ranks: int
     body_bytes: int
+    file_bytes: int
     points_per_sweep: int
     values_per_body: int
     nodes_per_case: int
@@ -219,6 +289,9 @@ class Limits(BaseModel):
     bytes_per_sweep: int
     queued_jobs: int
     page: int
+    private: bool
+    token: str | None
+    quotas: dict[str, Quota]
     states: dict[str, str]
 
 
@@ -226,105 +299,3 @@ class Health(BaseModel):
     """How the service is."""
 
     status: str
-
-
-# --- records into views -----------------------------------------------------------------------------------
-
-
-def moment(seconds: float) -> datetime:
-    """Seconds since 1970 as a time of day."""
-    return datetime.fromtimestamp(seconds, UTC)
-
-
-def maybe(seconds: float | None) -> datetime | None:
-    """The same of what may not have happened."""
-    return None if seconds is None else moment(seconds)
-
-
-def scalars(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every scalar by its dotted key; lists are left out."""
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from scalars(value, f"{prefix}{key}.")
-        elif not isinstance(value, list):
-            yield prefix + key, value
-
-
-def links(identifier: str) -> dict[str, str]:
-    """Addresses of all that a job has."""
-    this = f"/v1/jobs/{identifier}"
-    parts = {name: f"{this}/{name}" for name in ("history", "log", "events", "snapshots", "cancel", "retry")}
-    return {"self": this, **parts, "zarr": f"{this}/snapshots.zarr"}
-
-
-def summary(job: Job, hidden: str, case: Mapping[str, Any] | None = None) -> JobSummary:
-    """A job without its case. `hidden`: the path of the data folder, which no message shows."""
-    return JobSummary(**_summary(job, hidden, json.loads(job.case) if case is None else case))
-
-
-def _summary(job: Job, hidden: str, case: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "id": job.id, "name": job.name, "identity": job.identity, "state": job.state, "sentence": job.state.sentence,
-        "final": job.final, "stopping": job.stopping, "message": without_path(job.message, hidden),
-        "priority": job.priority, "ranks": job.ranks, "tags": list(job.tags), "time_limit": job.time_limit,
-        "attempt": job.attempt, "created": moment(job.created), "started": maybe(job.started),
-        "ended": maybe(job.ended), "core_seconds": job.core_seconds,
-        "parameters": dict(scalars(shown_case(case))), "result": job.result, "links": links(job.id),
-    }  # fmt: skip
-
-
-def detail(job: Job, hidden: str, attempts: list[Attempt], progress: dict[str, Any] | None) -> JobView:
-    """A job with all that is known of it."""
-    case = shown_case(json.loads(job.case))
-    tries = [
-        AttemptView(
-            number=a.number, state=a.state, message=without_path(a.message, hidden), started=moment(a.claimed),
-            ended=maybe(a.ended), core_seconds=a.core_seconds,
-        )
-        for a in attempts
-    ]  # fmt: skip
-    return JobView(**_summary(job, hidden, case), case=case, attempts=tries, progress=progress)
-
-
-def shown_case(case: Mapping[str, Any]) -> dict[str, Any]:
-    """The case with the name of its mesh file in the place of the server's path."""
-    nodes = case["nodes"]
-    if (path := nodes.get("path")) is None:
-        return dict(case)
-    return {**case, "nodes": {**nodes, "path": path.rpartition("/")[2]}}
-
-
-def without_path(message: str | None, hidden: str) -> str | None:
-    """A message that does not tell where on the server it happened."""
-    return message.replace(f"{hidden}/", "").replace(hidden, "data") if message else message
-
-
-def sweep_view(record: SweepRecord, new: int) -> SweepView:
-    """A sweep and its counts."""
-    return SweepView(**_sweep(record, new))
-
-
-def sweep_detail(record: SweepRecord, new: int) -> SweepDetail:
-    """A sweep with its definition."""
-    definition = json.loads(record.definition)
-    return SweepDetail(**_sweep(record, new), definition=_shown_paths(definition))
-
-
-def _sweep(record: SweepRecord, new: int) -> dict[str, Any]:
-    this = f"/v1/sweeps/{record.id}"
-    return {
-        "id": record.id, "name": record.name, "created": moment(record.created), "points": record.points,
-        "duplicates": record.duplicates, "new": new, "reused": record.points - new, "states": record.states,
-        "links": {"self": this, "jobs": f"/v1/jobs?sweep={record.id}", "compare": f"{this}/compare"},
-    }  # fmt: skip
-
-
-def _shown_paths(tree: Any, at: str = "") -> Any:
-    """The definition with names of files in the place of the server's paths."""
-    if isinstance(tree, dict):
-        return {key: _shown_paths(value, str(key)) for key, value in tree.items()}
-    if isinstance(tree, list):
-        return [_shown_paths(value, at) for value in tree]
-    if isinstance(tree, str) and at.rpartition(".")[2] == "path":
-        return tree.rpartition("/")[2]
-    return tree

@@ -10,6 +10,7 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from ..settings import Settings
+from .security import body_limit
 
 HEAD = 65_536  # bytes of a request's line and headers; one more piece of the network's may come with them
 HEAD_TIME = 30.0  # seconds in which they must come
@@ -20,7 +21,8 @@ TOO_LARGE = "The head of the request is too large."
 class LimitedProtocol(HttpToolsProtocol):
     """HTTP/1.1 whose heads are of limited size and come in limited time."""
 
-    body_limit = 0
+    settings: Settings
+    _most = 0  # bytes of the request that is read now
     _head: int | None = 0  # bytes of a head that is not complete; None: none is awaited
     _came = 0  # bytes of the request, with what frames its body
     _timer: asyncio.TimerHandle | None = None
@@ -50,6 +52,7 @@ class LimitedProtocol(HttpToolsProtocol):
         """The head is there."""
         self._end_wait()
         super().on_headers_complete()
+        self._most = 2 * body_limit(self.scope["path"], self.settings) + HEAD  # with what frames the body
 
     def data_received(self, data: bytes) -> None:
         """Parse what came, and count it while there is no whole head."""
@@ -60,7 +63,7 @@ class LimitedProtocol(HttpToolsProtocol):
             if self._head > HEAD:
                 self._end_wait()
                 self.send_400_response(TOO_LARGE)
-        elif self._came > 2 * self.body_limit + HEAD:  # the route has refused it long ago
+        elif self._came > self._most:  # the route has refused it long ago
             self.transport.abort()
 
     def _await_head(self) -> None:
@@ -77,7 +80,7 @@ class LimitedProtocol(HttpToolsProtocol):
 
 def options(settings: Settings) -> dict[str, Any]:
     """What uvicorn is told, however it is started."""
-    protocol = type("Protocol", (LimitedProtocol,), {"body_limit": settings.body_limit})
+    protocol = type("Protocol", (LimitedProtocol,), {"settings": settings})
     return {
         "http": protocol, "ws": "none", "limit_concurrency": settings.connections_limit,
         "server_header": False, "timeout_graceful_shutdown": LINGER,

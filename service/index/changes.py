@@ -2,15 +2,17 @@
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
 
+import sqlalchemy as sa
+
 from ..jobs.states import Exit, Job, Move, State, TransitionError, after
 from .keys import known, remember
-from .records import COLUMNS, NAMES, Key, NotFoundError, by_seq, compact, find_job, unpacked
-from .schema import attempts, events, history, jobs, snapshots
+from .records import COLUMNS, NAMES, Key, NotFoundError, by_seq, compact, find_job, find_sweep, record, unpacked
+from .schema import attempts, events, history, jobs, snapshots, sweep_jobs
 from .writer import Share, Transaction, Writer
 
 
@@ -31,6 +33,11 @@ class _End:
     end: Exit
     attempts_limit: int
     result: Mapping[str, Any] | None
+    size: int | None
+
+
+May = Callable[[str | None], bool]
+"""Whether who asks may change what this owner has."""
 
 
 class Changes(Writer):
@@ -58,13 +65,14 @@ class Changes(Writer):
         return self.put(Share(_start, _Start(identifier, attempt, handle), Future()))
 
     def finish(
-        self, identifier: str, end: Exit, attempts_limit: int, result: Mapping[str, Any] | None = None
-    ) -> "Future[Job]":
+        self, identifier: str, end: Exit, attempts_limit: int, result: Mapping[str, Any] | None = None,
+        size: int | None = None,
+    ) -> "Future[Job]":  # fmt: skip
         """An attempt has ended. Told twice, or of an attempt that is not the present one, it counts once.
 
-        result: the scalars by which the job is found from now on; None: those it has.
+        result: the scalars by which the job is found from now on; None: those it has. size: bytes of its directory.
         """
-        return self.put(Share(_finish, _End(identifier, end, attempts_limit, result), Future()))
+        return self.put(Share(_finish, _End(identifier, end, attempts_limit, result, size), Future()))
 
     def requeue(self, identifier: str, attempt: int) -> "Future[Job]":
         """The pause after a broken attempt is over."""
@@ -88,16 +96,32 @@ class Changes(Writer):
                 return find_job(t.connection, before)
             job = find_job(t.connection, identifier)
             remember(t, key, job.id)
-            if job.state is State.CANCELLED:
-                return job
-            if job.state.active:
-                set_columns(t, job, stopping=True)
+            return job if job.state is State.CANCELLED else _cancelled(t, job)
+
+        return self.write(effect)
+
+    def cancel_sweep(self, identifier: str, may: May, key: Key | None = None) -> "Future[list[Job]]":
+        """As `cancel`, of all jobs of a sweep that have not ended and that who asks may change; these."""
+        return self.write(lambda t: [_cancelled(t, job) for job in _members(t, identifier, may, key) if not job.final])
+
+    def retry_sweep(self, identifier: str, may: May, key: Key | None = None) -> "Future[list[Job]]":
+        """As `retry`, of all jobs of a sweep that have ended without success and that who asks may change; these."""
+
+        def effect(t: Transaction) -> list[Job]:
+            members = _members(t, identifier, may, key)
+            return [retried(t, job) for job in members if job.final and job.state is not State.SUCCEEDED]
+
+        return self.write(effect)
+
+    def change(self, identifier: str, values: Mapping[str, Any]) -> "Future[Job]":
+        """Give a job another name, other tags or another priority."""
+
+        def effect(t: Transaction) -> Job:
+            job = find_job(t.connection, identifier)
+            if values:
+                set_columns(t, job, **values)
                 t.durable = True
-                return by_seq(t.connection, job.seq)
-            if job.state in (State.ERROR, State.LOST) and not job.retrying:
-                raise TransitionError(job.state, Move.CANCEL)
-            t.durable = True
-            return move_to(t, job, Move.CANCEL, None, retrying=False, ended=time.time())
+            return by_seq(t.connection, job.seq)
 
         return self.write(effect)
 
@@ -208,6 +232,7 @@ def _finish(t: Transaction, wanted: Sequence[_End]) -> list[Job | NotFoundError]
             job, move, end.message, failures=failures, retrying=broke and end.again and failures < each.attempts_limit,
             stopping=False, ended=None if state is State.QUEUED else end.ended,
             core_seconds=(job.core_seconds or 0.0) + end.core_seconds,
+            bytes=job.bytes if each.size is None else each.size,
         )  # fmt: skip
     set_results(t, results)
     return _moved(t, rows, moves, [known[each.job] for each in wanted])
@@ -255,6 +280,26 @@ def set_columns(t: Transaction, job: Job, event: float | None = None, **values: 
     """Change columns of a job; `event`: when that made an event."""
     t.run(jobs.update().where(jobs.c.seq == job.seq).values(values))
     t.note("set", job=job.seq, event=event, values=values)
+
+
+def _cancelled(t: Transaction, job: Job) -> Job:
+    """At once where it has no cores, else it is marked."""
+    if job.state in (State.ERROR, State.LOST) and not job.retrying:
+        raise TransitionError(job.state, Move.CANCEL)
+    t.durable = True
+    if job.state.active:
+        set_columns(t, job, stopping=True)
+        return by_seq(t.connection, job.seq)
+    return move_to(t, job, Move.CANCEL, None, retrying=False, ended=time.time())
+
+
+def _members(t: Transaction, identifier: str, may: May, key: Key | None) -> list[Job]:
+    """The jobs of a sweep that may be changed; none where the key came before."""
+    if known(t, key) is not None:
+        return []
+    remember(t, key, identifier)
+    mine = sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == find_sweep(t.connection, identifier).seq)
+    return [job for row in t.run(sa.select(jobs).where(jobs.c.seq.in_(mine))) if may((job := record(row)).owner)]
 
 
 def retried(t: Transaction, job: Job, **values: Any) -> Job:

@@ -1,15 +1,11 @@
 """Questions to the index. None can change it, and each sees one moment of it."""
 
 import re
-import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
-from sqlalchemy.exc import DBAPIError
 
 from ..jobs.states import Job, State, Waiting
 from . import keys
@@ -18,43 +14,26 @@ from .records import (
     Attempt,
     Event,
     Key,
-    StoreError,
-    SweepPoint,
-    SweepRecord,
+    News,
     Token,
+    Usage,
     attempts_of,
     by_seq,
     find_job,
-    find_sweep,
     record,
 )
-from .schema import events, history, jobs, snapshots, sweep_jobs, sweeps
+from .removals import Removed, removed_rows
+from .schema import events, history, jobs, removed, snapshots
 from .submissions import existing
-from .writer import Transaction, make_engine, words_of
+from .sweep_queries import SweepQueries
+from .writer import Transaction
 
 FEW = 2000  # jobs that are sorted rather than walked along
 UPLOADED = re.compile(r"\b[0-9a-f]{64}\.[a-z]+")  # the name of an uploaded file
 
 
-class Queries:
+class Queries(SweepQueries):
     """Part of the store. All methods raise `StoreError` where the index cannot be read."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._reader = make_engine(path, writer=False)
-
-    def close(self) -> None:
-        """Close the connections."""
-        self._reader.dispose()
-
-    @contextmanager
-    def reading(self) -> Iterator[Connection]:
-        """A connection that sees one moment of the database and cannot change it. Raises `StoreError`."""
-        try:
-            with self._reader.connect() as connection:
-                yield connection
-        except (DBAPIError, sa.exc.TimeoutError) as error:
-            raise StoreError(f"{self.path}: {words_of(error)}") from error
 
     def job(self, identifier: str) -> Job:
         """By its id, or by the first characters of it where they suffice. Raises `NotFoundError`."""
@@ -107,10 +86,11 @@ class Queries:
             records = {row.seq: record(row) for row in rows}
         return [(records[seq], at) for seq, at in places]
 
-    def queued(self, limit: int) -> list[Waiting]:
-        """The first jobs in the queue: by priority, then by age."""
-        query = "SELECT seq, ranks, owner FROM jobs WHERE state = ? ORDER BY priority DESC, seq LIMIT ?"
-        return [Waiting(*row) for row in self._ask(query, (State.QUEUED, limit))]
+    def queued(self, limit: int, without: Sequence[str] = ()) -> list[Waiting]:
+        """The first jobs in the queue, but for those of some owners: by priority, then by age."""
+        others = f"AND ifnull(owner, '') NOT IN ({', '.join('?' * len(without))}) " if without else ""
+        query = f"SELECT seq, ranks, owner FROM jobs WHERE state = ? {others}ORDER BY priority DESC, seq LIMIT ?"
+        return [Waiting(*row) for row in self._ask(query, (State.QUEUED, *without, limit))]
 
     def unfinished(self) -> tuple[list[tuple[Job, Attempt]], list[Job]]:
         """Jobs that have cores with their present attempt, and jobs that wait for another attempt."""
@@ -171,61 +151,6 @@ class Queries:
             query = sa.select(snapshots).where(snapshots.c.job == seq).order_by(snapshots.c.number)
             return [(row.number, row.time) for row in connection.execute(query)]
 
-    def sweep(self, identifier: str) -> SweepRecord:
-        """By its id, or by its name: then the newest of that name. Raises `NotFoundError`."""
-        with self.reading() as connection:
-            return find_sweep(connection, identifier)
-
-    def sweeps(self, before: int | None = None, limit: int = 50) -> list[SweepRecord]:
-        """Newest first; `before`: only those with a smaller seq."""
-        query = sa.select(sweeps.c.id).order_by(sweeps.c.seq.desc()).limit(limit)
-        with self.reading() as connection:
-            if before is not None:
-                query = query.where(sweeps.c.seq < before)
-            return [find_sweep(connection, row.id) for row in connection.execute(query)]
-
-    def sweep_points(self, identifier: str) -> list[SweepPoint]:
-        """The jobs of a sweep in its own order."""
-        with self.reading() as connection:
-            seq = find_sweep(connection, identifier).seq
-            named = sa.select(jobs, sweep_jobs.c.position, sweep_jobs.c.name.label("label"), sweep_jobs.c.parameters)
-            query = named.join_from(sweep_jobs, jobs).where(sweep_jobs.c.sweep == seq).order_by(sweep_jobs.c.position)
-            return [
-                SweepPoint(row.position, row.label, row.parameters, record(row)) for row in connection.execute(query)
-            ]
-
-    def new_in_sweeps(self, which: Sequence[int]) -> dict[int, int]:
-        """How many jobs of each sweep (by seq) were made with it."""
-        query = (
-            sa.select(sweep_jobs.c.sweep, sa.func.count()).join_from(sweep_jobs, jobs).join(sweeps)
-            .where(sweep_jobs.c.sweep.in_(which), jobs.c.created >= sweeps.c.created).group_by(sweep_jobs.c.sweep)
-        )  # fmt: skip
-        with self.reading() as connection:
-            found = {seq: n for seq, n in connection.execute(query)}
-        return {seq: found.get(seq, 0) for seq in which}
-
-    def curves(self, sweep: int, observable: str) -> dict[int, list[tuple[float, float | None]]]:
-        """(time, value) of an observable along the history of each job (by seq) of a sweep (by seq)."""
-        value = sa.func.json_extract(history.c.data, f"$.{observable}")
-        mine = sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep)
-        query = sa.select(history.c.job, history.c.time, value).where(history.c.job.in_(mine))
-        found: dict[int, list[tuple[float, float | None]]] = {}
-        with self.reading() as connection:
-            for job, at, number in connection.execute(query.order_by(history.c.job, history.c.row)):
-                found.setdefault(job, []).append((at, number))
-        return found
-
-    def observables(self, sweep: int) -> list[str]:
-        """Names of the scalars in the history rows of a sweep's jobs, as the first row of each has them."""
-        mine = sa.select(sweep_jobs.c.job).where(sweep_jobs.c.sweep == sweep)
-        each = sa.func.json_each(history.c.data).table_valued("key", "type")
-        query = (
-            sa.select(each.c.key).distinct().select_from(history).join(each, sa.true())
-            .where(history.c.job.in_(mine), history.c.row == 0, each.c.type.in_(["integer", "real", "null"]))
-        )  # fmt: skip
-        with self.reading() as connection:
-            return [row.key for row in connection.execute(query)]
-
     def identities(self, which: Sequence[str]) -> dict[str, Job]:
         """Of these identities, the newest job each has."""
         with self.reading() as connection:
@@ -243,6 +168,41 @@ class Queries:
         with self.reading() as connection:
             return [(row.case, row.core_seconds) for row in connection.execute(query)]
 
+    def unsettled(self) -> list[Removed]:
+        """What is gone, but not all of it: a service ended in the middle."""
+        with self.reading() as connection:
+            return removed_rows(connection.execute(sa.select(removed).where(~removed.c.done)).all())
+
+    def news(self, since: int, limit: int, owner: str | None = None) -> list[News]:
+        """What has happened to any job after event number `since`; owner: to the jobs of this one."""
+        told = sa.select(events.c.seq, jobs.c.id, jobs.c.name, events.c.at, events.c.state, events.c.message)
+        told = told.join_from(events, jobs).where(events.c.seq > since)
+        nothing = sa.null()
+        gone = sa.select(removed.c.event, removed.c.id, nothing, removed.c.at, removed.c.kind, nothing)
+        gone = gone.where(removed.c.event > since)
+        if owner is not None:
+            told, gone = told.where(jobs.c.owner == owner), gone.where(removed.c.owner == owner)
+        with self.reading() as connection:
+            rows = [*connection.execute(told.order_by(events.c.seq).limit(limit))]
+            rows += connection.execute(gone.order_by(removed.c.event).limit(limit))
+        return sorted((News(*row) for row in rows), key=lambda news: news.seq)[:limit]
+
+    def last_event(self) -> int:
+        """The number of the newest event."""
+        [(last,)] = self._ask("SELECT ifnull((SELECT seq FROM sqlite_sequence WHERE name = 'events'), 0)")
+        return int(last)
+
+    def usage(self, owner: str) -> Usage:
+        """What the jobs of an owner take, and have taken."""
+        query = (
+            "SELECT count(*) FILTER (WHERE state = 'queued'), "
+            "ifnull(sum(ranks) FILTER (WHERE state IN ('starting', 'running')), 0), "
+            "ifnull(sum(core_seconds), 0.0) + (SELECT ifnull(sum(core_seconds), 0.0) FROM removed WHERE owner = ?1), "
+            "ifnull(sum(bytes), 0) FROM jobs WHERE owner = ?1"
+        )
+        [row] = self._ask(query, (owner,))
+        return Usage(*row)
+
     def active_tokens(self) -> dict[str, Token]:
         """The tokens that count now, by hash."""
         rows = self._ask("SELECT hash, name, scope, created FROM tokens WHERE revoked IS NULL")
@@ -252,14 +212,3 @@ class Queries:
         """Whether a token was ever made, also one that is revoked by now."""
         return bool(self._ask("SELECT 1 FROM tokens LIMIT 1"))
 
-    def _ask(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
-        """What is asked all the time: no layer between it and SQLite."""
-        try:
-            connection = self._reader.raw_connection()
-            try:
-                found: list[Any] = connection.cursor().execute(query, values).fetchall()
-                return found
-            finally:
-                connection.close()
-        except (DBAPIError, sqlite3.Error, sa.exc.TimeoutError) as error:
-            raise StoreError(f"{self.path}: {error}") from error

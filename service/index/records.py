@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
@@ -74,6 +74,36 @@ class Event:
     at: float
     state: State
     message: str | None
+
+
+class News(NamedTuple):
+    """Something that happened to a job; `state` is `job` or `sweep` where that is gone."""
+
+    seq: int
+    id: str
+    name: str | None
+    at: float
+    state: str
+    message: str | None
+
+
+class Compared(NamedTuple):
+    """A job of a sweep among others."""
+
+    seq: int
+    id: str
+    name: str
+    state: State
+    parameters: dict[str, Any]
+
+
+class Usage(NamedTuple):
+    """What somebody's jobs take now and have taken."""
+
+    queued: int
+    cores: int
+    core_seconds: float
+    bytes: int
 
 
 @dataclass(frozen=True, slots=True)

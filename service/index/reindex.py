@@ -25,8 +25,8 @@ from ..jobs.processes import try_lock
 from ..jobs.runner import read_exit
 from ..jobs.states import State
 from .journal import Journal
-from .results import Reader
-from .schema import attempts, events, idempotency, jobs, sweep_jobs, sweeps
+from .results import Reader, size_of
+from .schema import attempts, events, idempotency, jobs, removed, sweep_jobs, sweeps
 from .store import Store
 from .writer import Transaction
 
@@ -91,6 +91,7 @@ class Book:
     events: list[Row] = field(default_factory=list)
     sweeps: dict[int, Row] = field(default_factory=dict)
     keys: dict[str, Row] = field(default_factory=dict)
+    gone: dict[tuple[str, int], Row] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     _state: dict[int, str] = field(default_factory=dict)  # of each job's last event
 
@@ -126,14 +127,28 @@ class Book:
                 self.sweeps[line["seq"]] = whole(sweeps, {"owner": None, **line}) | {"points": line["points"]}
             case "key":
                 self.keys[line["key"]] = whole(idempotency, line)
+            case "gone":
+                self._lose(line)
             case kind:
                 raise ValueError(f"kind = {kind!r}")
+
+    def _lose(self, line: Row) -> None:
+        """Somebody wanted it gone, and was told that it is."""
+        what, seq = line.pop("what"), line["seq"]
+        if what == "sweep":
+            self.sweeps.pop(seq, None)
+        elif self.jobs.pop(seq, None) is not None:
+            self._forget(seq)
+        self.gone[what, seq] = whole(removed, {**line, "kind": what, "event": -1 - len(self.gone), "done": True})
+
+    def _forget(self, seq: int) -> None:
+        self.events = [event for event in self.events if event["job"] != seq]
+        self.attempts = {where: attempt for where, attempt in self.attempts.items() if where[0] != seq}
 
     def _add(self, row: Row) -> None:
         seq, row = row["seq"], whole(jobs, FRESH | row)
         if seq in self.jobs:
-            self.events = [event for event in self.events if event["job"] != seq]
-            self.attempts = {where: attempt for where, attempt in self.attempts.items() if where[0] != seq}
+            self._forget(seq)
         self.jobs[seq] = row
         self._tell(seq, row["created"], State.QUEUED, None)
 
@@ -157,14 +172,17 @@ class Book:
 
     def _unknown_jobs(self, runs: Path) -> Iterator[Row]:
         known = {row["id"] for row in self.jobs.values()}
+        lost = {row["id"] for row in self.gone.values()} - known
         found = []
         for directory in sorted(runs.iterdir()) if runs.exists() else []:
-            if directory.name not in known:
+            if directory.name in lost:  # a crash came before all of it was deleted
+                shutil.rmtree(directory, ignore_errors=True)
+            elif directory.name not in known:
                 try:
                     found.append(job_of(directory))
                 except (OSError, ValueError, LookupError, CaseError) as error:
                     self.problems.append(f"{directory}: not understood as the run directory of a job: {error!r}")
-        taken = set(self.jobs)
+        taken = {*self.jobs, *(seq for kind, seq in self.gone if kind == "job")}
         for row in sorted(found, key=lambda row: (row["created"], row["id"])):
             if row["seq"] is None or row["seq"] in taken:
                 row["seq"] = max(taken, default=0) + 1
@@ -198,7 +216,7 @@ class Book:
             for seq, sweep in self.sweeps.items()
             for k, (job, name, parameters) in enumerate(sweep["points"])
         ]
-        lost = [row for row in members if row["job"] not in self.jobs]
+        lost = [row for row in members if row["job"] not in self.jobs and ("job", row["job"]) not in self.gone]
         self.problems += [f"sweep s{row['sweep']}: the job of point {row['position']} is lost" for row in lost]
         plain = [whole(sweeps, row) for row in self.sweeps.values()]
         for table, rows in (
@@ -208,9 +226,12 @@ class Book:
             (attempts, [row for row in self.attempts.values() if row["job"] in self.jobs and "cores" in row]),
             (events, self.events),
             (idempotency, list(self.keys.values())),
+            (removed, list(self.gone.values())),
         ):
             if rows:
                 t.run(table.insert(), rows)
+        for table, kind in ((jobs, "job"), (sweeps, "sweep")):  # no number is given twice
+            t.last_number(table.name, max((seq for what, seq in self.gone if what == kind), default=0))
 
     def take_in(self, store: Store, seq: int, directory: Path, attempts_limit: int) -> None:
         """What a run directory holds: history, snapshots, the end that was not told, the last values."""
@@ -235,7 +256,7 @@ class Book:
         if (lock := try_lock(directory / "runner.lock")) is None:
             return state
         os.close(lock)
-        return done(store.finish(row["id"], end, attempts_limit)).state
+        return done(store.finish(row["id"], end, attempts_limit, size=size_of(directory))).state
 
 
 def whole(table: sa.Table, row: Row) -> Row:
@@ -253,6 +274,7 @@ def job_of(directory: Path) -> Row:
     keys = ("name", "ranks", "priority", "tags", "time_limit", "created")
     identity = record.get("identity") or parse_case(json.loads(case)).identity()
     row = {"seq": record.get("seq"), "id": directory.name, "identity": identity, "case": case}
+    row |= {key: record.get(key) for key in ("owner", "origin")}
     return row | {key: record[key] for key in keys}
 
 

@@ -6,6 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,16 @@ def check_row(path: Path, number: int, line: str) -> None:
         sound = False
     if not sound:
         raise ValueError(f"{path}: row {number} is damaged: {line[:80]!r}")
+
+
+def size_of(directory: Path) -> int:
+    """Bytes of all files in a run directory, as far as they can be seen."""
+    size = 0
+    for folder, _, names in os.walk(directory):
+        for name in names:
+            with suppress(OSError):
+                size += os.lstat(os.path.join(folder, name)).st_size
+    return size
 
 
 class Follower:

@@ -6,11 +6,12 @@ from . import migrations
 from .changes import Changes
 from .journal import Journal
 from .queries import Queries
+from .removals import Removals
 from .submissions import Submissions
 from .writer import Writer
 
 
-class Store(Submissions, Changes, Queries):
+class Store(Submissions, Changes, Removals, Queries):
     """Methods that change it give a future, done once the change is durable."""
 
     def __init__(self, folder: Path, writable: bool = True) -> None:

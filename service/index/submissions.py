@@ -34,17 +34,35 @@ class Submissions(Writer):
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
         return self.put(Share(_submit, _Submission(job, key), Future()))
 
+    def rerun(self, identifier: str, owner: str | None, key: Key | None = None) -> "Future[Job]":
+        """Queue the case of a job once more, from its start, as a job of its own."""
+
+        def effect(t: Transaction) -> Job:
+            if (before := known(t, key)) is not None:
+                return find_job(t.connection, before)
+            old = find_job(t.connection, identifier)
+            asked = {name: getattr(old, name) for name in ("case", "identity", "name", "ranks", "priority", "tags")}
+            [job] = _insert(t, [NewJob(**asked, time_limit=old.time_limit, owner=owner, origin=old.id)])
+            remember(t, key, job.id)
+            return job
+
+        return self.write(effect)
+
     def submit_sweep(
-        self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None
-    ) -> "Future[SweepRecord]":
-        """Queue the points of a sweep that no job has yet; jobs of the same case that were not done are tried again."""
+        self, name: str, definition: str, points: Sequence[NewPoint], duplicates: int = 0, key: Key | None = None,
+        owner: str | None = None, shared: bool = True,
+    ) -> "Future[SweepRecord]":  # fmt: skip
+        """Queue the points of a sweep that no job has yet; jobs of the same case that were not done are tried again.
+
+        shared: whether jobs of other owners count.
+        """
 
         def effect(t: Transaction) -> SweepRecord:
             if (before := known(t, key)) is not None:
                 return find_sweep(t.connection, before)
-            row = _insert_sweep(t, name, definition, duplicates)
+            row = _insert_sweep(t, name, definition, duplicates, owner)
             seq, identifier = row["seq"], row["id"]
-            numbers = _jobs_of_points(t, points)
+            numbers = _jobs_of_points(t, points, (jobs.c.owner.is_not_distinct_from(owner),) if not shared else ())
             members = [(numbers[point.job.identity], point.job.name, dict(point.parameters)) for point in points]
             t.note("sweep", **row, points=members)
             rows = [
@@ -109,7 +127,7 @@ def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
             {"id": job.identity[:16] + (f"-{again}" if again > 1 else ""), "name": job.name, "identity": job.identity,
              "state": State.QUEUED.value, "priority": job.priority, "ranks": job.ranks, "tags": job.tags,
              "time_limit": job.time_limit, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
-             "created": now, "result": {}, "case": job.case}
+             "created": now, "result": {}, "case": job.case, "owner": job.owner, "origin": job.origin}
         )  # fmt: skip
     if not made:
         return []
@@ -125,33 +143,38 @@ def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
 
 
 def times_before(t: Transaction, which: Sequence[str]) -> dict[str, int]:
-    """How many jobs each identity has had."""
+    """How many jobs each identity has had, those that are gone too."""
     found: dict[str, int] = {}
     for k in range(0, len(which), 500):
         part = which[k : k + 500]
         marks = ", ".join("?" * len(part))
-        query = f"SELECT identity, count(*) FROM jobs WHERE identity IN ({marks}) GROUP BY identity"
-        found |= dict(t.ask(query, part))
+        for table in ("jobs", "removed"):
+            query = f"SELECT identity, count(*) FROM {table} WHERE identity IN ({marks}) GROUP BY identity"
+            for identity, count in t.ask(query, part):
+                found[identity] = found.get(identity, 0) + count
     return found
 
 
-def existing(connection: Connection, which: Sequence[str]) -> dict[str, int]:
+def existing(connection: Connection, which: Sequence[str], *among: sa.ColumnElement[bool]) -> dict[str, int]:
     """The seq of a job of each identity: of one that succeeded, if any did, else of the newest."""
     done = sa.case((jobs.c.state == State.SUCCEEDED, SUCCEEDED), else_=0)
     found: dict[str, int] = {}
     for k in range(0, len(which), 500):
-        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq + done)).where(jobs.c.identity.in_(which[k : k + 500]))
+        same = jobs.c.identity.in_(which[k : k + 500])
+        part = sa.select(jobs.c.identity, sa.func.max(jobs.c.seq + done)).where(same, *among)
         found |= {identity: seq % SUCCEEDED for identity, seq in connection.execute(part.group_by(jobs.c.identity))}
     return found
 
 
-def _jobs_of_points(t: Transaction, points: Sequence[NewPoint]) -> dict[str, int]:
+def _jobs_of_points(
+    t: Transaction, points: Sequence[NewPoint], among: Sequence[sa.ColumnElement[bool]]
+) -> dict[str, int]:
     """The seq of a job for each point's identity: an old one where there is one, tried again if it did not get done.
 
     Whoever queued the old one may have wished for less: it gets the priority, the time and the ranks asked for now.
     """
     asked = {point.job.identity: point.job for point in points}
-    numbers = existing(t.connection, list(asked))
+    numbers = existing(t.connection, list(asked), *among)
     old = list(numbers.values())
     undone = jobs.c.state.in_([State.ERROR, State.LOST, State.CANCELLED, State.TIMED_OUT]) & ~jobs.c.retrying
     waiting = (jobs.c.state == State.QUEUED) | jobs.c.retrying
@@ -187,10 +210,10 @@ def _more(job: Any, asked: NewJob) -> dict[str, Any]:
     return more
 
 
-def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int) -> dict[str, Any]:
-    seq = t.run(sa.select(sa.func.coalesce(sa.func.max(sweeps.c.seq), 0))).scalar_one() + 1
+def _insert_sweep(t: Transaction, name: str, definition: str, duplicates: int, owner: str | None) -> dict[str, Any]:
+    seq = t.last_number("sweeps") + 1
     row = {"seq": seq, "id": f"s{seq}", "name": name, "definition": definition, "duplicates": duplicates}
-    row["created"] = time.time()
+    row |= {"created": time.time(), "owner": owner}
     t.run(sweeps.insert(), [row])
     t.durable = True
     return row

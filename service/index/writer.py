@@ -62,6 +62,14 @@ class Transaction:
         if rows:
             self.raw.executemany(_change(table.name, tuple(rows[0]), tuple(which)), rows)
 
+    def last_number(self, table: str, least: int = 0) -> int:
+        """The largest number that a row of the table has had, gone or not; from now on at least `least`."""
+        row = "SELECT 1 FROM sqlite_sequence WHERE name = ?1"
+        self.ask(f"INSERT INTO sqlite_sequence (name, seq) SELECT ?1, 0 WHERE NOT EXISTS ({row})", (table,))
+        change = "UPDATE sqlite_sequence SET seq = max(seq, ?2) WHERE name = ?1 RETURNING seq"
+        [(number,)] = self.ask(change, (table, least))
+        return int(number)
+
     @property
     def raw(self) -> sqlite3.Connection:
         """SQLite's own connection."""

@@ -3,16 +3,18 @@
 import asyncio
 import errno
 import os
-from contextlib import AsyncExitStack, suppress
+import shutil
+from collections.abc import Sequence
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from frit.solver.durable import make_private
 
-from ..http.security import check_address
-from ..http.uploads import Shelf
+from ..index.changes import May
 from ..index.migrations import IndexVersionError
 from ..index.records import Key, NewPoint, StoreError, SweepRecord
+from ..index.removals import Removed
 from ..index.results import Follower
 from ..index.store import Store
 from ..settings import Settings
@@ -27,8 +29,6 @@ if TYPE_CHECKING:
     from frit.sweeps.definition import Sweep
     from frit.sweeps.expand import Expansion
 
-TIDY = 3600.0  # seconds between two looks for uploads that nothing uses
-
 
 class EngineError(RuntimeError):
     """The data folder cannot be used; the message says why."""
@@ -40,12 +40,12 @@ class Engine:
     store: Store
     notifier: Notifier
     scheduler: Scheduler
-    shelf: Shelf
 
     def __init__(self, settings: Settings, backend: Backend | None = None) -> None:
         """backend: where jobs run; the cores of this machine unless told."""
         self.settings = settings
         self._backend = backend
+        self._settling = set[asyncio.Task[None]]()
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -62,33 +62,21 @@ class Engine:
             backend = self._backend or LocalBackend(self.settings.cores, self.settings.patience)
             self._follower = Follower(self.store, self.settings.runs)
             self.scheduler = Scheduler(self.settings, self.store, self.notifier, backend, self._follower)
+            stack.push_async_callback(self._ended)
             stack.push_async_callback(self.scheduler.close)
+            await self._settle(await asyncio.to_thread(self.store.unsettled))
             await self.scheduler.adopt()
             loop = asyncio.create_task(self.scheduler.run())
             stack.callback(loop.cancel)
-            self.shelf = Shelf(self.settings)
-            stack.callback(self.shelf.close)
-            tidying = asyncio.create_task(self._tidy())
-            stack.callback(tidying.cancel)
             self._stack = stack.pop_all()
         return self
 
+    async def _ended(self) -> None:
+        """Removals under way come to their end."""
+        await asyncio.gather(*self._settling, return_exceptions=True)
+
     async def __aexit__(self, *_: object) -> None:
         await self._stack.aclose()
-
-    async def _tidy(self) -> None:
-        """Remove, every hour, uploads that nothing uses."""
-        while True:
-            with suppress(OSError, StoreError):  # it will go better the next time
-                await asyncio.to_thread(self._tidy_once)
-            await asyncio.sleep(TIDY)
-
-    def _tidy_once(self) -> None:
-        """Nothing while there are more run directories than jobs: a lost index does not know what they use."""
-        with os.scandir(self.settings.runs) as folders:
-            runs = sum(1 for _ in folders)
-        if runs <= sum(self.store.counts().values()):
-            self.shelf.tidy(self.store.files_used())
 
     async def cancel(self, identifier: str, key: Key | None = None) -> Job:
         """End a job: at once where it has no cores, else its runner is told. A key that came before changes nothing.
@@ -99,6 +87,43 @@ class Engine:
         if job.stopping:
             await self.scheduler.stop(job, "cancelled")
         return job
+
+    async def cancel_sweep(self, identifier: str, may: May, key: Key | None = None) -> None:
+        """The same for all jobs of a sweep that have not ended and that who asks may change."""
+        for job in await asyncio.wrap_future(self.store.cancel_sweep(identifier, may, key)):
+            if job.stopping:
+                await self.scheduler.stop(job, "cancelled")
+
+    async def remove(self, identifiers: Sequence[str]) -> None:
+        """Delete jobs that have ended, with their run directories: all of them, or none, for good.
+
+        Raises `NotFoundError`, `TransitionError`, `InUseError`.
+        """
+        await self._settle(await asyncio.wrap_future(self.store.remove(identifiers)))
+
+    async def remove_sweep(self, identifier: str) -> None:
+        """Delete a sweep and the jobs that it alone refers to. Raises as `remove` does."""
+        await self._settle(await asyncio.wrap_future(self.store.remove_sweep(identifier)))
+
+    async def _settle(self, gone: list[Removed]) -> None:
+        """Do what remains of removals, whether or not somebody still waits for that."""
+        if gone:
+            settling = asyncio.create_task(self._settled(gone))
+            self._settling.add(settling)
+            settling.add_done_callback(self._settling.discard)
+            await asyncio.shield(settling)
+
+    async def _settled(self, gone: list[Removed]) -> None:
+        await asyncio.wrap_future(self.store.mourn(gone))
+        done = [each for each in gone if await asyncio.to_thread(self._cleared, each)]
+        await asyncio.wrap_future(self.store.settle(done))
+
+    def _cleared(self, gone: Removed) -> bool:
+        """Delete its directory; what cannot be deleted now is tried again by the next service."""
+        directory = self.run_directory(gone.id)
+        if gone.kind == "job":
+            shutil.rmtree(directory, ignore_errors=True)
+        return gone.kind != "job" or not os.path.lexists(directory)
 
     async def submit_sweep(self, sweep: "Sweep", expansion: "Expansion", key: Key | None = None) -> SweepRecord:
         """Queue what is missing of a sweep."""
@@ -120,21 +145,6 @@ class Engine:
     def run_directory(self, identifier: str) -> Path:
         """Where a job's files are."""
         return self.settings.runs / identifier
-
-
-def check(settings: Settings) -> str | None:
-    """Say early why a service cannot be started, or answers nobody. Raises `EngineError`, `AddressError`."""
-    lock = take(settings.data)
-    try:
-        store = Store(settings.data)
-        try:
-            return check_address(settings, store)
-        finally:
-            store.close()
-    except (IndexVersionError, StoreError) as error:
-        raise EngineError(str(error)) from error
-    finally:
-        os.close(lock)
 
 
 def take(data: Path) -> int:

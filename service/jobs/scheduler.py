@@ -8,14 +8,15 @@ import logging
 import shutil
 import signal
 import time
-from collections.abc import Coroutine
+from collections import Counter
+from collections.abc import Coroutine, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from frit.solver.durable import write_json, write_whole
 
 from ..index.records import Attempt, NotFoundError, StoreError
-from ..index.results import Follower
+from ..index.results import Follower, size_of
 from ..index.store import Store
 from ..settings import Settings
 from .backends.protocol import Backend, BackendError, FolderError, Handle
@@ -101,9 +102,14 @@ class Scheduler:
 
     def _ahead(self, free: int) -> list[Waiting]:
         """The first in the queue: as many as there are cores free where those fit, else `AHEAD`."""
-        queue = self.store.queued(free)
-        fit = sum(job.ranks for job in queue) <= free or len(queue) < free
-        return queue if fit else self.store.queued(AHEAD)
+        most, cores = self.settings.quota_cores, Counter[str | None]()
+        for job in self.running.values():
+            cores[job.owner] += job.ranks
+        full = [owner for owner in cores if owner is not None and most is not None and cores[owner] >= most]
+        queue = self.store.queued(free, full)
+        if sum(job.ranks for job in queue) > free and len(queue) == free:
+            queue = self.store.queued(AHEAD, full)
+        return queue if most is None else [*within(queue, cores, most)]
 
     async def stop(self, job: Job, reason: str) -> None:
         """Tell a job's runner to checkpoint and end; `reason` is one of runner.STOPS."""
@@ -218,9 +224,10 @@ class Scheduler:
     async def _end(self, job: Job, end: Exit) -> None:
         """Into the index with it, history first, and its cores back."""
         result = await self._results(job)
+        size = await asyncio.to_thread(size_of, self.settings.runs / job.id)
         limit = self.settings.attempts
         try:
-            ended = await self._insist(lambda: self.store.finish(job.id, end, limit, result or None))
+            ended = await self._insist(lambda: self.store.finish(job.id, end, limit, result or None, size))
         except NotFoundError as error:  # taken out of the index under the service: it has ended all the same
             logger.warning("%s", error)
             ended = None
@@ -327,6 +334,14 @@ class Scheduler:
         if free >= self.settings.free_disk:
             return None
         return f"{self.settings.data}: {free} bytes free, no job is started below {self.settings.free_disk}"
+
+
+def within(queue: Sequence[Waiting], cores: Counter[str | None], most: int) -> Iterator[Waiting]:
+    """Those that leave their owner within that many cores, `cores` being what each has now."""
+    for job in queue:
+        if job.owner is None or cores[job.owner] + job.ranks <= most:
+            cores[job.owner] += job.ranks
+            yield job
 
 
 def make_directory(directory: Path, job: Job) -> None:

@@ -55,6 +55,7 @@ class Move(StrEnum):
     START = "start"  # the runner has recorded itself
     CANCEL = "cancel"  # somebody asks for the end of a job that has no cores
     RETRY = "retry"  # somebody asks for another attempt
+    DELETE = "delete"  # somebody wants it gone; there is no state after that
     REQUEUE = "requeue"  # the pause after ERROR or LOST is over
     RELEASE = "release"  # the runner was asked to stop for now
     SUCCEED = "succeed"
@@ -101,6 +102,8 @@ class TransitionError(ValueError):
         allowed = [before for before, m in TRANSITIONS if m == move]
         if move is Move.CANCEL:  # the end of a job that has cores is a wish first, and a move once it is obeyed
             allowed += [before for before in State if before.active]
+        if move is Move.DELETE:
+            allowed = [before for before in State if before is not State.QUEUED and not before.active]
         words = ", ".join(before for before in allowed if before is not state)
         super().__init__(f"state = '{state}': {move} is possible only from {words}")
 

@@ -21,10 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from ..jobs.launch import Launch, LaunchError, Outcome, read_record
-from . import index as commands_index
-from . import server as commands_server
-from . import sweep as commands_sweep
-from . import token as commands_token
+from . import compare, index, jobs, serve, service, sweep, token
 from .terminal import AsJson, cell, in_words, refuse
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
@@ -37,10 +34,11 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(commands_index.db, name="db")
-app.command()(commands_index.reindex)
-app.add_typer(commands_sweep.app, name="sweep")
-app.add_typer(commands_token.app, name="token")
+app.add_typer(index.db, name="db")
+app.command()(index.reindex)
+app.add_typer(sweep.app, name="sweep")
+app.add_typer(token.app, name="token")
+app.add_typer(service.files, name="files")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -147,7 +145,10 @@ def plot(
         refuse(str(error))
 
 
-commands_server.add_to(app)
+for command in (serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
+                jobs.change, jobs.gc, compare.compare, service.plan, service.limits, service.events):  # fmt: skip
+    app.command()(command)
+app.command("rm")(jobs.remove)
 
 
 @app.command("pack")

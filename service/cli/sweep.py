@@ -1,4 +1,4 @@
-"""`frit sweep plan` and `frit sweep run`: a sweep's cost before it starts, and the sweep itself without a server."""
+"""`frit sweep`: a sweep's cost before it starts, the sweep itself without a server, and the sweeps of a service."""
 
 import asyncio
 import json
@@ -13,9 +13,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from frit.solver.characters import visible
+
+from .speaking import HERE, Secret, SweepId, Url, row, speaking, tell, tell_rows
 from .terminal import AsJson, DataFolder, SweepFile, in_words, refuse, show_table
 
-app = typer.Typer(no_args_is_help=True, help="Sweeps over packings: what they cost, and running them without a server.")
+app = typer.Typer(no_args_is_help=True, help="Sweeps: their cost, running them without a server, those of a service.")
 
 WIDEST = 44  # characters of a name in a table
 
@@ -71,6 +74,44 @@ def run(
         if status == 130:
             typer.echo("interrupted; the same command goes on", err=True)
     raise typer.Exit(status)
+
+
+@app.command(name="list")
+def list_sweeps(url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """List the sweeps of a service, newest first."""
+    with speaking(url, token) as client:
+        rows = [sweep.data for sweep in client.sweeps()]
+    shown = [{key: str(value) if key == "states" else value for key, value in row.items()} for row in rows]
+    tell_rows(rows, as_json, [{key: row[key] for key in ("id", "name", "points", "states")} for row in shown])
+
+
+@app.command()
+def show(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """Show a sweep of a service and its jobs."""
+    with speaking(url, token) as client:
+        found = client.sweep(sweep)
+        rows = [job.data if as_json else row(job) for job in found.jobs()]
+    if as_json:
+        typer.echo(json.dumps({**found.data, "jobs": rows}, indent=2))
+        return
+    typer.echo(f"{found.id} {visible(found.name)}: {found.states}")
+    show_table(rows)
+
+
+@app.command()
+def cancel(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """End all jobs of a sweep of a service."""
+    with speaking(url, token) as client:
+        found = client.sweep(sweep).cancel()
+    tell(found.data, as_json, f"{found.id} {found.states}")
+
+
+@app.command()
+def retry(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """Queue all jobs of a sweep of a service that did not succeed again."""
+    with speaking(url, token) as client:
+        found = client.sweep(sweep).retry()
+    tell(found.data, as_json, f"{found.id} {found.states}")
 
 
 def expanded(file: Path) -> tuple[Any, Any]:

@@ -5,11 +5,16 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
+from frit.solver.characters import HIDDEN
+
 from . import openapi, shown, views
 from .asking import TheEngine, TheRooms, made
 from .security import Reader, Submitter
+from .uploads import SUFFIXES
 
 PROBLEMS = openapi.problems
+
+NAME = rf"^[^{HIDDEN}]*\.({'|'.join(suffix[1:] for suffix in SUFFIXES)})$"
 
 api = APIRouter(prefix="/v1")
 
@@ -20,7 +25,7 @@ api = APIRouter(prefix="/v1")
 )  # fmt: skip
 async def upload_file(
     request: Request, rooms: TheRooms, who: Submitter,
-    name: Annotated[str, Query(min_length=1, max_length=200, description="As `mesh.msh`: says what it is.")],
+    name: Annotated[str, Query(max_length=200, pattern=NAME, description="As `mesh.msh`.")],
 ) -> Response:  # fmt: skip
     """Upload a mesh or particle file as it is, however large. Its `id` then does for `path` in a case or sweep."""
     await asyncio.to_thread(rooms.quotas.admit, who, 0)

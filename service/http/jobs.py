@@ -7,6 +7,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.responses import StreamingResponse
 
+from ..index.records import NotFoundError
 from . import admission, delivery, filters, openapi, shown, stream, views
 from .asking import (
     GivenKey,
@@ -65,10 +66,14 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
     """
     store = engine.store
 
+    def seq_of(name: str) -> int:
+        sweep = store.sweep(name)
+        if not who.sees(sweep.owner):
+            raise NotFoundError(f"sweep {name!r}: there is none")
+        return sweep.seq
+
     def page() -> tuple[views.JobPage, str | None]:
-        selection = filters.select(
-            request.query_params.multi_items(), lambda name: store.sweep(name).seq, who.only
-        )
+        selection = filters.select(request.query_params.multi_items(), seq_of, who.only)
         value = None if selection.scalar is None else selection.scalar.sql
         found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.few, selection.near)
         listed = [shown.summary(job, hidden(engine)) for job, _ in found[: selection.limit]]

@@ -150,7 +150,8 @@ def complete(app: FastAPI, cores: int) -> None:
             details = ProblemDetails.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= details.pop("$defs", {}) | {"ProblemDetails": details}
             ranks = schemas["JobSubmission"]["properties"]["ranks"]
-            for form in (ranks, schemas["SweepSubmission"]["properties"]["ranks"]["anyOf"][0]):
+            others = [schemas[name]["properties"]["ranks"]["anyOf"][0] for name in ("SweepSubmission", "PlanRequest")]
+            for form in (ranks, *others):
                 form["maximum"] = cores
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)

@@ -20,7 +20,7 @@ import anyio.to_thread
 from frit.solver.durable import flush, read_json, write_json
 
 from .problems import HttpError, WrongField, not_found, refused, shown
-from .uploads import BESIDE, Shelf, check_suffix
+from .uploads import BESIDE, Shelf
 
 CARD = ".card"  # the last suffix of a card
 
@@ -44,7 +44,6 @@ class Stored:
     async def receive(self, name: str, pieces: AsyncIterator[bytes], owner: str | None) -> StoredFile:
         """Take a file as it comes. Raises `HttpError` for one that is refused; nothing of it is left then."""
         try:
-            check_suffix(name)
             self.shelf.folder.mkdir(parents=True, exist_ok=True)
             work = Path(tempfile.mkdtemp(prefix=BESIDE, dir=self.shelf.folder))
             try:

@@ -226,16 +226,11 @@ class Shelf:
         return removed
 
 
-def check_suffix(name: str) -> None:
-    """Raises `HttpError` for a name that is not of a mesh or of particles."""
+def content_of(name: str, file: FileContent) -> bytes:
+    """The file's bytes. Raises `HttpError`."""
     suffix = re.sub(r"^.*(?=\.)", "", name, flags=re.DOTALL).lower()
     if suffix not in SUFFIXES:
         raise not_taken(name, f"must end in one of {', '.join(SUFFIXES)}", shown(name))
-
-
-def content_of(name: str, file: FileContent) -> bytes:
-    """The file's bytes. Raises `HttpError`."""
-    check_suffix(name)
     try:
         return file.content.encode() if file.encoding == "text" else base64.b64decode(file.content, validate=True)
     except (binascii.Error, ValueError):

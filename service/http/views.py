@@ -97,7 +97,15 @@ class JobChanges(Body):
 class PlanRequest(Body):
     """A case, or the definition of a sweep."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"case": EXAMPLE_CASE}, {"definition": EXAMPLE_SWEEP}]})
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"case": EXAMPLE_CASE}, {"definition": EXAMPLE_SWEEP}],
+            "oneOf": [
+                {"required": [one], "properties": {one: {"type": "object"}, other: {"type": "null"}}}
+                for one, other in (("case", "definition"), ("definition", "case"))
+            ],
+        }
+    )
 
     case: dict[str, Any] | None = None
     definition: dict[str, Any] | None = None

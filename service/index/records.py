@@ -164,6 +164,9 @@ def unpacked(values: dict[str, Any]) -> Job:
     return Job(**{**values, "result": json.loads(values["result"])})
 
 
+WHOLE = 16  # characters of an identity that an id begins with
+
+
 # --- finding ---------------------------------------------------------------------------------------------
 
 
@@ -175,7 +178,7 @@ def by_seq(connection: Connection, seq: int) -> Job:
 def find_job(connection: Connection, identifier: str) -> Job:
     """By its id, or by the first characters of it where they suffice. Raises `NotFoundError`."""
     row = connection.execute(sa.select(jobs).where(jobs.c.id == identifier)).first()
-    if row is None and len(identifier) >= 4:
+    if row is None and 4 <= len(identifier) < WHOLE:  # a whole id is nobody else's beginning, once its job is gone
         near = sa.select(jobs).where(jobs.c.id > identifier, jobs.c.id < identifier + "\uffff").limit(2)
         found = connection.execute(near).all()
         row = found[0] if len(found) == 1 else None

@@ -139,7 +139,8 @@ class Book:
             self.sweeps.pop(seq, None)
         elif self.jobs.pop(seq, None) is not None:
             self._forget(seq)
-        self.gone[what, seq] = whole(removed, {**line, "kind": what, "event": -1 - len(self.gone), "done": True})
+        known = self.gone.get((what, seq), {"event": -1 - len(self.gone)})  # a crash may have it told twice
+        self.gone[what, seq] = whole(removed, {**line, "kind": what, "event": known["event"], "done": True})
 
     def _forget(self, seq: int) -> None:
         self.events = [event for event in self.events if event["job"] != seq]

@@ -12,7 +12,7 @@ from sqlalchemy.engine import Connection
 from ..jobs.states import Job, NewJob, State
 from .changes import retried, set_columns
 from .keys import known, remember, reused
-from .records import Key, KeyReusedError, NewPoint, SweepRecord, compact, find_job, find_sweep, record
+from .records import WHOLE, Key, KeyReusedError, NewPoint, SweepRecord, compact, find_job, find_sweep, record
 from .schema import events, idempotency, jobs, sweep_jobs, sweeps
 from .writer import Share, Transaction, Writer
 
@@ -124,7 +124,8 @@ def _insert(t: Transaction, new: Sequence[NewJob]) -> list[Job]:
     for job in new:
         base[job.identity] = again = base.get(job.identity, 0) + 1
         made.append(
-            {"id": job.identity[:16] + (f"-{again}" if again > 1 else ""), "name": job.name, "identity": job.identity,
+            {"id": job.identity[:WHOLE] + (f"-{again}" if again > 1 else ""), "name": job.name,
+             "identity": job.identity,
              "state": State.QUEUED.value, "priority": job.priority, "ranks": job.ranks, "tags": job.tags,
              "time_limit": job.time_limit, "attempt": 0, "failures": 0, "retrying": False, "stopping": False,
              "created": now, "result": {}, "case": job.case, "owner": job.owner, "origin": job.origin}

@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .client import Client, ProblemError, RemoteJob, RemoteSweep
+    from .client import Client, ProblemError
+    from .remote import RemoteJob, RemoteSweep
 
 __all__ = ["Client", "ProblemError", "RemoteJob", "RemoteSweep"]
 

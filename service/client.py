@@ -6,21 +6,21 @@ idempotency key: nothing is submitted twice.
 
 import base64
 import json
+import os
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import httpx2
 
-if TYPE_CHECKING:
-    import pandas as pd
+from .remote import LONGEST_PAUSE, RemoteJob, RemoteSweep
 
-LONGEST_PAUSE = 2.0  # seconds between two tries, or two looks at a job
 QUIET = 60.0  # seconds without a sign of life of a stream before it is opened anew; signs come every 15
 PASSING = (502, 503, 504)
+LARGE = 5_000_000  # bytes of a file that is not sent along with a case, but before it
 
 Tree = dict[str, Any]
 Options = Mapping[str, Any]
@@ -48,16 +48,10 @@ class Event:
     id: str
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """A complete snapshot: its place along the arrays' first axis, and its model time."""
-
-    number: int
-    time: float
-
-
 class Client:
     """Speaks to one service; also a context manager."""
+
+    Problem = ProblemError
 
     def __init__(
         self, url: str = "http://127.0.0.1:8000", token: str | None = None, *, timeout: float = 30.0,
@@ -84,49 +78,69 @@ class Client:
         self, what: str | Path | Mapping[str, Any], *, ranks: int | None = None, name: str | None = None,
         priority: int | None = None, tags: Sequence[str] | None = None, time_limit: float | None = None,
         recompute: bool = False,
-    ) -> "RemoteJob | RemoteSweep":  # fmt: skip
+    ) -> RemoteJob | RemoteSweep:  # fmt: skip
         """Submit a case, or a sweep, which has a base: a TOML or JSON file, or a tree of plain values.
 
         Mesh and particle files that it names are read here and sent along. time_limit: wall-clock seconds. recompute:
         of a sweep also what an older revision of the solver computed; a case is computed at any rate.
         Raises `CaseError` for what is wrong here already, `ProblemError` for what the service refuses.
         """
-        from frit.solver.case import read_tree
-
-        tree = dict(what) if isinstance(what, Mapping) else read_tree(what)
-        folder = Path() if isinstance(what, Mapping) else Path(what).parent
+        kind, tree, files = self._sendable(what)
         options: Tree = {"ranks": ranks, "name": name, "priority": priority, "time_limit": time_limit}
         given = {key: value for key, value in options.items() if value is not None}
         given |= {} if tags is None else {"tags": list(tags)}
-        if isinstance(tree, Mapping) and "base" in tree:
-            return self._submit_sweep(tree, folder, given | ({"recompute": True} if recompute else {}))
-        return self._submit_case(tree, folder, given)
+        if kind == "definition":
+            given |= {"recompute": True} if recompute else {}
+            return RemoteSweep(self, self.post("/v1/sweeps", {"definition": tree, "files": files, **given}))
+        return RemoteJob(self, self.post("/v1/jobs", {"case": tree, "files": files, **given}))
 
-    def submit_sweep(self, definition: str | Path | Mapping[str, Any], **options: Any) -> "RemoteSweep":
+    def _sendable(self, what: str | Path | Mapping[str, Any]) -> tuple[str, Tree, Tree]:
+        """Whether it is a `case` or a `definition`, the resolved tree with names of files, and the files."""
+        from frit.solver.case import parse_case, read_tree
+        from frit.sweeps.definition import parse_sweep
+
+        tree = dict(what) if isinstance(what, Mapping) else read_tree(what)
+        folder = Path() if isinstance(what, Mapping) else Path(what).parent
+        if isinstance(tree, Mapping) and "base" in tree:
+            return "definition", *self._with_files(json.loads(parse_sweep(tree, base=folder).resolved_json()))
+        return "case", *self._with_files(parse_case(tree, base=folder).tree())
+
+    def _with_files(self, tree: Tree) -> tuple[Tree, Tree]:
+        """The tree with names in the place of paths, and the files by these names; large ones are uploaded before."""
+        files: Tree = {}
+        names: dict[str, str] = {}
+
+        def name_of(path: str) -> str:
+            if path not in names and Path(path).stat().st_size > LARGE:
+                names[path] = self.upload(path)["id"]
+            elif path not in names:
+                names[path] = f"{len(names)}-{Path(path).name}"
+                content = base64.b64encode(Path(path).read_bytes()).decode()
+                files[names[path]] = {"content": content, "encoding": "base64"}
+            return names[path]
+
+        def replaced(node: Any, key: str = "") -> Any:
+            if isinstance(node, dict):
+                return {name: replaced(value, name) for name, value in node.items()}
+            if isinstance(node, list):
+                return [replaced(value, key) for value in node]
+            return name_of(node) if isinstance(node, str) and key.rpartition(".")[2] == "path" else node
+
+        return replaced(tree), files
+
+    def submit_sweep(self, definition: str | Path | Mapping[str, Any], **options: Any) -> RemoteSweep:
         """As `submit`, of what is a sweep."""
         submitted = self.submit(definition, **options)
         assert isinstance(submitted, RemoteSweep)  # anything else has been refused
         return submitted
 
-    def _submit_case(self, tree: Any, folder: Path, given: Options) -> "RemoteJob":
-        from frit.solver.case import parse_case
-
-        case, files = with_files(parse_case(tree, base=folder).tree())
-        return RemoteJob(self, self.post("/v1/jobs", {"case": case, "files": files, **given}))
-
-    def _submit_sweep(self, tree: Mapping[str, Any], folder: Path, given: Options) -> "RemoteSweep":
-        from frit.sweeps.definition import parse_sweep
-
-        definition, files = with_files(json.loads(parse_sweep(tree, base=folder).resolved_json()))
-        return RemoteSweep(self, self.post("/v1/sweeps", {"definition": definition, "files": files, **given}))
-
     # --- looking ------------------------------------------------------------------------------------------
 
-    def job(self, identifier: str) -> "RemoteJob":
+    def job(self, identifier: str) -> RemoteJob:
         """A job by its id."""
         return RemoteJob(self, self.get(f"/v1/jobs/{identifier}"))
 
-    def jobs(self, **filters: Any) -> Iterator["RemoteJob"]:
+    def jobs(self, **filters: Any) -> Iterator[RemoteJob]:
         """Jobs that fit, newest first, page by page as they are used.
 
         Filters and `order` as in HTTP, with __ in the place of a dot: `jobs(particles__mean_radius__ge=9, tag="a")`.
@@ -134,11 +148,11 @@ class Client:
         for row in self._pages("/v1/jobs", "jobs", filters):
             yield RemoteJob(self, row)
 
-    def sweep(self, identifier: str) -> "RemoteSweep":
+    def sweep(self, identifier: str) -> RemoteSweep:
         """A sweep by its id or name."""
         return RemoteSweep(self, self.get(f"/v1/sweeps/{identifier}"))
 
-    def sweeps(self) -> Iterator["RemoteSweep"]:
+    def sweeps(self) -> Iterator[RemoteSweep]:
         """Sweeps, newest first."""
         for row in self._pages("/v1/sweeps", "sweeps", {}):
             yield RemoteSweep(self, row)
@@ -155,6 +169,39 @@ class Client:
             page = self.get(page["next"])
             yield from page[name]
 
+    def plan(self, what: str | Path | Mapping[str, Any], *, ranks: int | None = None) -> Tree:
+        """What a case or sweep would cost; nothing is submitted. Raises as `submit` does."""
+        kind, tree, files = self._sendable(what)
+        return self.post("/v1/plan", {kind: tree, "files": files, **({} if ranks is None else {"ranks": ranks})})
+
+    def schema(self, of: str = "case") -> Tree:
+        """JSON Schema of a case, or of a `sweep`."""
+        return self.get("/v1/schema", params={"of": of})
+
+    def news(self, since: int | None = None) -> "Iterator[Event]":
+        """What happens to all jobs, without end: `state` and `deleted`; since: after that event, 0: from the first."""
+        path = "/v1/events" if since is None else f"/v1/events?since={since}"
+        return (event for event in self.events(path) if event.kind != "begin")
+
+    # --- files --------------------------------------------------------------------------------------------
+
+    def upload(self, path: str | Path, name: str | None = None) -> Tree:
+        """Upload a mesh or particle file by itself; its `id` then does for `path` in a case or sweep."""
+        with open(path, "rb") as file:
+            size, kind = os.fstat(file.fileno()).st_size, "application/octet-stream"
+            headers = {"Content-Type": kind, "Content-Length": str(size)}
+            query = {"name": name or Path(path).name}
+            found: Tree = self.request("POST", "/v1/files", params=query, content=file, headers=headers).json()
+        return found
+
+    def files(self) -> Iterator[Tree]:
+        """Files that were uploaded by themselves, newest first."""
+        return self._pages("/v1/files", "files", {})
+
+    def remove_file(self, identifier: str) -> None:
+        """Of those that nothing refers to."""
+        self.delete(f"/v1/files/{identifier}")
+
     # --- requests -----------------------------------------------------------------------------------------
 
     def get(self, path: str, **options: Any) -> Tree:
@@ -168,15 +215,25 @@ class Client:
         answer: Tree = self.request("POST", path, json=body, headers=headers).json()
         return answer
 
+    def delete(self, path: str) -> None:
+        """A DELETE; where the answer to an earlier try was lost, what is not there was deleted by that."""
+        self.request("DELETE", path)
+
     def request(self, method: str, path: str, **options: Any) -> httpx2.Response:
         """A good response; what fails on the way is tried again."""
+        lost = False
         for last in self._tries():
+            if (file := options.get("content")) is not None:
+                file.seek(0)
             try:
                 response = self._http.request(method, path, **options)
             except httpx2.TransportError:
                 if last:
                     raise
+                lost = True
                 continue
+            if lost and method == "DELETE" and response.status_code == 404:
+                return response
             if response.status_code in PASSING and not last:
                 continue
             if response.is_error:
@@ -228,187 +285,7 @@ class Client:
                 yield Event(event.event, json.loads(event.data), event.id or last)
 
 
-class RemoteJob:
-    """A job as the service last told it; `refresh` asks again."""
-
-    def __init__(self, client: Client, data: Tree) -> None:
-        self.client, self.data = client, data
-
-    def __repr__(self) -> str:
-        return f"<job {self.id} {self.name!r}: {self.state}>"
-
-    @property
-    def id(self) -> str:
-        """Of the job."""
-        return str(self.data["id"])
-
-    @property
-    def name(self) -> str:
-        """Of the job."""
-        return str(self.data["name"])
-
-    @property
-    def state(self) -> str:
-        """queued, starting, running, succeeded, failed, error, cancelled, timed_out or lost."""
-        return str(self.data["state"])
-
-    @property
-    def final(self) -> bool:
-        """Whether nothing more happens by itself."""
-        return bool(self.data["final"])
-
-    @property
-    def message(self) -> str | None:
-        """What was said at its end."""
-        message: str | None = self.data["message"]
-        return message
-
-    @property
-    def parameters(self) -> Tree:
-        """Every scalar of the case by dotted key."""
-        parameters: Tree = self.data["parameters"]
-        return parameters
-
-    @property
-    def result(self) -> Tree:
-        """Scalars of the last history row."""
-        result: Tree = self.data["result"]
-        return result
-
-    @property
-    def zarr_url(self) -> str:
-        """What zarr and xarray open: `xarray.open_zarr(job.zarr_url)`."""
-        return f"{self.client.url}/v1/jobs/{self.id}/snapshots.zarr"
-
-    def refresh(self) -> Self:
-        """Ask again."""
-        self.data = self.client.get(f"/v1/jobs/{self.id}")
-        return self
-
-    def wait(self, timeout: float | None = None) -> Self:
-        """Until it is final, whatever it then is: see `state`. Raises `TimeoutError` after that many seconds."""
-        for _ in looks(timeout, f"job {self.id}"):
-            if self.refresh().final:
-                break
-        return self
-
-    def history(self) -> "pd.DataFrame":
-        """The history rows so far, a column per key."""
-        import pandas as pd
-
-        return pd.DataFrame(self.client.request("GET", f"/v1/jobs/{self.id}/history").json())
-
-    def stream(self) -> Iterator[Event]:
-        """What has happened and happens, up to its end."""
-        return self.client.events(f"/v1/jobs/{self.id}/events")
-
-    def log(self, offset: int = 0) -> str:
-        """The solver's log from that byte on."""
-        return self.log_bytes(offset).decode(errors="replace")
-
-    def log_bytes(self, offset: int = 0) -> bytes:
-        """The same, to be counted: the next offset is the old one and its length."""
-        headers = {"Range": f"bytes={offset}-"} if offset else {}
-        try:
-            response = self.client.request("GET", f"/v1/jobs/{self.id}/log", headers=headers)
-        except ProblemError as error:
-            if error.status == 416:  # nothing new
-                return b""
-            raise
-        return response.content if response.status_code == 206 or not offset else response.content[offset:]
-
-    def snapshots(self) -> list[Snapshot]:
-        """The complete snapshots; their fields are at `zarr_url`."""
-        found = self.client.get(f"/v1/jobs/{self.id}/snapshots")["snapshots"]
-        return [Snapshot(row["number"], row["time"]) for row in found]
-
-    def cancel(self) -> Self:
-        """Ask for its end."""
-        self.data = self.client.post(f"/v1/jobs/{self.id}/cancel")
-        return self
-
-    def retry(self) -> Self:
-        """Queue it again."""
-        self.data = self.client.post(f"/v1/jobs/{self.id}/retry")
-        return self
-
-
-class RemoteSweep:
-    """A sweep as the service last told it; `refresh` asks again."""
-
-    def __init__(self, client: Client, data: Tree) -> None:
-        self.client, self.data = client, data
-
-    def __repr__(self) -> str:
-        return f"<sweep {self.id} {self.name!r}: {self.states}>"
-
-    @property
-    def id(self) -> str:
-        """Of the sweep."""
-        return str(self.data["id"])
-
-    @property
-    def name(self) -> str:
-        """Of the sweep."""
-        return str(self.data["name"])
-
-    @property
-    def states(self) -> dict[str, int]:
-        """How many of its jobs are in which state."""
-        states: dict[str, int] = self.data["states"]
-        return states
-
-    def refresh(self) -> Self:
-        """Ask again."""
-        self.data = self.client.get(f"/v1/sweeps/{self.id}")
-        return self
-
-    def jobs(self, **filters: Any) -> Iterator[RemoteJob]:
-        """Its jobs, in the order of their submission."""
-        return self.client.jobs(sweep=self.id, **{"order": "created", **filters})
-
-    def wait(self, timeout: float | None = None) -> Self:
-        """Until every job is final. Raises `TimeoutError` after that many seconds."""
-        for _ in looks(timeout, f"sweep {self.id}"):
-            if not self._unfinished():
-                break
-        return self.refresh()
-
-    def _unfinished(self) -> bool:
-        going = {"queued", "starting", "running"} & self.refresh().states.keys()
-        return bool(going) or any(not job.final for job in self.jobs(state="error,lost"))
-
-    def history(self) -> "pd.DataFrame":
-        """The history rows of all its jobs, with a column `job`."""
-        import pandas as pd
-
-        tables = [job.history().assign(job=job.id) for job in self.jobs()]
-        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-    def compare(self, observable: str = "vacancy_ratio") -> Tree:
-        """An observable of all its jobs over time, with the parameters that differ."""
-        return self.client.get(f"/v1/sweeps/{self.id}/compare", params={"observable": observable})
-
-    def cancel(self) -> Self:
-        """Ask for the end of all its jobs that have not ended."""
-        for job in self.jobs(state="queued,starting,running"):
-            job.cancel()
-        return self.refresh()
-
-
 # --- helpers ----------------------------------------------------------------------------------------------
-
-
-def looks(timeout: float | None, what: str) -> Iterator[None]:
-    """Again and again, with growing pauses. Raises `TimeoutError`."""
-    start, pause = time.monotonic(), 0.05
-    while True:
-        yield
-        left = pause if timeout is None else start + timeout - time.monotonic()
-        if left <= 0:
-            raise TimeoutError(f"{what}: not done after {timeout} s")
-        time.sleep(min(pause, left))
-        pause = min(1.5 * pause, LONGEST_PAUSE)
 
 
 def spelled(value: Any) -> str:
@@ -429,25 +306,3 @@ def problem_of(response: httpx2.Response) -> Tree:
     except ValueError:
         pass
     return {"title": response.reason_phrase, "status": response.status_code, "detail": response.text[:200]}
-
-
-def with_files(tree: Tree) -> tuple[Tree, Tree]:
-    """The tree with names in the place of paths, and the files by these names."""
-    files: Tree = {}
-    names: dict[str, str] = {}
-
-    def name_of(path: str) -> str:
-        if path not in names:
-            names[path] = f"{len(names)}-{Path(path).name}"
-            content = base64.b64encode(Path(path).read_bytes()).decode()
-            files[names[path]] = {"content": content, "encoding": "base64"}
-        return names[path]
-
-    def replaced(node: Any, key: str = "") -> Any:
-        if isinstance(node, dict):
-            return {name: replaced(value, name) for name, value in node.items()}
-        if isinstance(node, list):
-            return [replaced(value, key) for value in node]
-        return name_of(node) if isinstance(node, str) and key.rpartition(".")[2] == "path" else node
-
-    return replaced(tree), files

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from .memory import memory_per_core
+from .jobs.memory import memory_per_core
 
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -80,6 +80,19 @@ class Settings(BaseSettings):
     """bytes of a mesh once it is converted, at most"""
     conversions: AtLeastOne = 2
     """requests whose files are read at the same time"""
+
+    file_limit: AtLeastOne = 500_000_000
+    """bytes of a file that is uploaded by itself, at most"""
+    private: bool = False
+    """jobs, sweeps and files are seen by the token that made them and by tokens of scope admin only"""
+    quota_queued: AtLeastOne | None = None
+    """jobs of a token that wait in the queue, at most"""
+    quota_cores: AtLeastOne | None = None
+    """cores that the jobs of a token have at once, at most"""
+    quota_core_hours: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    """core-hours that the jobs of a token have taken, also those that are deleted, above which it submits no more"""
+    quota_bytes: AtLeastOne | None = None
+    """bytes that run directories and files of a token take, above which it submits no more"""
 
     @property
     def runs(self) -> Path:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import h5py
 import numpy as np
 
 from .arrays import Floats
+from .durable import replace_durably
 from .geometry import Mesh
 from .partition import Collector
 from .scheme import Scheme
@@ -116,15 +116,3 @@ def by_rows(directory: Path) -> bool:
 def mesh_hash(mesh: Mesh) -> str:
     """A fingerprint of the nodes and cells."""
     return hashlib.sha256(np.ascontiguousarray(mesh.nodes).tobytes() + mesh.cells.tobytes()).hexdigest()
-
-
-def replace_durably(beside: Path, path: Path) -> None:
-    """Make a finished file durable and put it in the place of the old one: a reader sees the one or the other."""
-    with open(beside, "rb") as file:
-        os.fsync(file.fileno())
-    os.replace(beside, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

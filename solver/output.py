@@ -13,7 +13,7 @@ import numpy as np
 
 from .arrays import Floats, Numbers
 from .case import Case
-from .checkpoint import replace_durably
+from .durable import replace_durably, write_whole
 from .partition import Collector, Ranks
 
 BLOCK = 65_536  # nodes per chunk of a snapshot
@@ -34,10 +34,8 @@ def write_json(path: Path, tree: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write beside, make durable, rename; safe where several ranks do so at once."""
-    beside = path.with_name(f"{path.name}.{os.getpid()}.new")
-    beside.write_text(text)
-    replace_durably(beside, path)
+    """Durable, whole or not at all; safe where several ranks write the same file at once."""
+    write_whole(path, text.encode())
 
 
 def remove_torn(directory: Path) -> None:

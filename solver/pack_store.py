@@ -6,7 +6,6 @@ packed again. Replicates that share a packing, and runs that start anew, find it
 
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from . import particle_file
 from .case import Case
+from .durable import write_json
 from .jit import cache_root
 from .pack_measures import solid_fraction
 from .packing import Packing, Request, make, request
@@ -54,9 +54,7 @@ def write(path: Path, packing: Packing) -> None:
     """Into the cache: a reader sees all of it or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     body = json.dumps([packing.centres.tolist(), packing.radii.tolist(), packing.realised])
-    beside = path.with_name(f"{path.name}.{os.getpid()}.new")
-    beside.write_text(json.dumps({"sha256": hashlib.sha256(body.encode()).hexdigest(), "packing": body}))
-    os.replace(beside, path)
+    write_json(path, {"sha256": hashlib.sha256(body.encode()).hexdigest(), "packing": body}, durable=False)
 
 
 def read(path: Path) -> Packing | None:

@@ -5,7 +5,6 @@ the names of the columns (`r` will do for `radius`) are skipped.
 """
 
 import math
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .arrays import Floats
+from .durable import write_whole
 
 NANOMETRES = {"nm": 1.0, "um": 1e3, "mm": 1e6, "m": 1e9}  # in a unit
 MOST_WRONG, MOST_COUNTED = 50, 1000  # wrong cells that are told, and counted
@@ -72,9 +72,7 @@ def write(path: Path, centres: Floats, radii: Floats) -> None:
     """A CSV that `read` turns into the same numbers; a reader sees all of it or nothing."""
     header = ",".join([*"xyz"[: centres.shape[1]], "radius"])
     rows = (",".join(map(repr, row)) for row in np.column_stack([centres, radii]).tolist())
-    beside = path.with_name(f"{path.name}.{os.getpid()}.new")
-    beside.write_text("\n".join([header, *rows]) + "\n")
-    os.replace(beside, path)
+    write_whole(path, ("\n".join([header, *rows]) + "\n").encode(), durable=False)
 
 
 def _cells(line: str) -> list[str]:

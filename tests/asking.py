@@ -16,9 +16,9 @@ import httpx2
 import uvicorn
 from fastapi.testclient import TestClient
 
-from frit.service.app import create_app
+from frit.service.http.app import create_app
+from frit.service.http.wire import options
 from frit.service.settings import Settings
-from frit.service.wire import options
 
 Tree = dict[str, Any]
 
@@ -48,7 +48,7 @@ PACKING: Tree = {
 SERVER = """
 import sys, uvicorn
 from pathlib import Path
-from frit.service.app import create_app
+from frit.service.http.app import create_app
 from frit.service.settings import Settings
 settings = Settings(data=Path(sys.argv[1]), cores=1, free_disk=int(sys.argv[3]), poll=0.05)
 uvicorn.run(create_app(settings), port=int(sys.argv[2]), log_level="warning", timeout_graceful_shutdown=1)

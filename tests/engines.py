@@ -10,8 +10,8 @@ from typing import Any
 
 import psutil
 
-from frit.service.engine import Engine
-from frit.service.jobs import Job, NewJob
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.states import Job, NewJob
 from frit.service.settings import Settings
 from frit.solver.case import parse_case
 

@@ -8,8 +8,9 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from frit.service.jobs import Exit, Job, Move, NewJob
-from frit.service.store import NewPoint, Store
+from frit.service.index.records import NewPoint
+from frit.service.index.store import Store
+from frit.service.jobs.states import Exit, Job, Move, NewJob
 
 T = TypeVar("T")
 LIMIT = 3  # attempts in a row
@@ -50,7 +51,7 @@ def claim(store: Store, job: Job) -> Job:
 def started(store: Store, job: Job) -> Job:
     """Give a queued job a core and a runner."""
     claimed = claim(store, job)
-    return done(store.start(claimed.id, claimed.attempt, 4711, 1234, "boot"))
+    return done(store.start(claimed.id, claimed.attempt, {"pid": 4711}))
 
 
 def ended(store: Store, job: Job, move: Move, message: str | None = None) -> Job:

@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 import zarr
 
-from frit.service.launch import OPEN_MPI, clean_environment, is_open_mpi, mpirun_command, solver_arguments
+from frit.service.jobs.launch import OPEN_MPI, clean_environment, is_open_mpi, mpirun_command, solver_arguments
 from frit.solver.arrays import Array
 
 Case = dict[str, dict[str, Any]]

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from frit.service.engine import Engine
-from frit.service.jobs import Job, NewJob, State
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.states import Job, NewJob, State
 from frit.service.settings import Settings
 from frit.solver.case import parse_case
 
@@ -119,7 +119,7 @@ async def until(engine: Engine, condition: Callable[[], bool]) -> None:
     """Wait for a condition on the index; TimeoutError is a hang."""
     async with asyncio.timeout(TIMEOUT):
         while not condition():
-            await engine.hub.wait(0.1)
+            await engine.notifier.wait(0.1)
 
 
 async def ended(engine: Engine, *jobs: Job) -> list[Job]:

@@ -20,11 +20,12 @@ from typing import Any
 
 import psutil
 
-from frit.service.files import read_json, start_of
-from frit.service.jobs import Job, NewJob, State
-from frit.service.runner import advanced
-from frit.service.store import Store
+from frit.service.index.store import Store
+from frit.service.jobs.processes import start_of
+from frit.service.jobs.runner import advanced
+from frit.service.jobs.states import Job, NewJob, State
 from frit.solver.case import parse_case
+from frit.solver.durable import read_json
 
 TREE = ("runner", "mpirun", "rank")
 VICTIMS = ("service", *TREE, *TREE)
@@ -33,7 +34,7 @@ SPARED = 3  # two below the five, because a kill may come while another's end is
 # The engine alone, as `frit serve` and `frit sweep run` have it inside; killed and started again by the soak.
 SERVICE = """
 import asyncio, sys
-from frit.service.engine import Engine
+from frit.service.jobs.engine import Engine
 from frit.service.settings import Settings
 
 async def main():

@@ -7,11 +7,11 @@ import pytest
 from asking import PACKING, TINY, Tree, service
 from test_case import altered
 
-from frit.service.admission import job_of, sweep_of
-from frit.service.problems import HttpError
-from frit.service.reckoning import excesses, need
+from frit.service.http.admission import job_of, sweep_of
+from frit.service.http.problems import HttpError
+from frit.service.http.reckoning import excesses, need
+from frit.service.http.views import JobSubmission, SweepSubmission
 from frit.service.settings import Settings
-from frit.service.views import JobSubmission, SweepSubmission
 from frit.solver.case import load_case, parse_case
 from frit.solver.geometry import lattice
 from frit.solver.partition import Ranks

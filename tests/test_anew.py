@@ -12,8 +12,8 @@ import pytest
 from launching import PAIR, TIMEOUT, Case, Tree, different, history, launch, record, resume, solve
 from serving import ended, new_job, settings, submit
 
-from frit.service.engine import Engine
-from frit.service.jobs import LONGEST_MESSAGE, NewJob, State, one_sentence
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.states import LONGEST_MESSAGE, NewJob, State, one_sentence
 from frit.solver import output
 from frit.solver.failure import comes_again, told
 from frit.solver.slots import SlotError
@@ -67,7 +67,7 @@ def test_the_case_alone_is_enough(tmp_path: Path) -> None:
     """As the command says, too."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "case.json").write_text(json.dumps(PAIR))
-    command = [sys.executable, "-P", "-c", "from frit.service.cli import main; main()", "resume", "run"]
+    command = [sys.executable, "-P", "-c", "from frit.service.cli.main import main; main()", "resume", "run"]
     ended_ = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     assert ended_.returncode == 0, ended_.stderr
     assert "run has no checkpoint yet: it is begun anew from its case.json" in ended_.stderr

@@ -10,11 +10,11 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
-from frit.service import bodies
-from frit.service.bodies import measure, unshowable
-from frit.service.problems import MOST_BYTES, MOST_ERRORS, beginning, shown
-from frit.service.views import JobSubmission
-from frit.service.words import cell
+from frit.service.cli.terminal import cell
+from frit.service.http import bodies
+from frit.service.http.bodies import measure, unshowable
+from frit.service.http.problems import MOST_BYTES, MOST_ERRORS, beginning, shown
+from frit.service.http.views import JobSubmission
 from frit.solver.case import CaseError, parse_case
 from frit.solver.characters import visible
 from frit.sweeps.definition import parse_sweep

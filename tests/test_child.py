@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager
 
 import pytest
 
-from frit.service.child import UNHEARD, Child
+from frit.service.jobs.child import UNHEARD, Child
 
 
 @contextmanager

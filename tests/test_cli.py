@@ -20,7 +20,8 @@ import pytest
 import zarr
 from typer.testing import CliRunner, Result
 
-from frit.service import cli, launch
+from frit.service.cli import main as cli
+from frit.service.jobs import launch
 
 STAND_IN = """
 import json, os, signal, sys, time
@@ -235,7 +236,7 @@ def started(folder: Path, act: str, **streams: Any) -> "subprocess.Popen[str]":
     script = (
         "import fcntl, os, termios\n"
         "if os.isatty(0): fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"
-        "from frit.service import cli, launch\n"
+        "from frit.service.cli import main as cli\nfrom frit.service.jobs import launch\n"
         f"launch.solver_arguments = lambda: {launch.solver_arguments()!r}\n"
         "cli.main()\n"
     )

@@ -25,7 +25,7 @@ FRIT = """
 import fcntl, os, termios
 if os.isatty(0):
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-from frit.service.cli import main
+from frit.service.cli.main import main
 main()
 """
 # Long enough to be interrupted wherever it runs; nobody waits for its end.

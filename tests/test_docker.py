@@ -19,9 +19,9 @@ import pytest
 import yaml
 from asking import LONG, TINY, free_port
 
-from frit.service.app import create_app
 from frit.service.client import Client
-from frit.service.launch import kill_marked
+from frit.service.http.app import create_app
+from frit.service.jobs.launch import kill_marked
 from frit.service.settings import Settings
 
 ROOT = Path(__file__).parents[1]

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from serving import ended, new_job, settings, submit, until
 
-from frit.service import tokens
-from frit.service.engine import Engine, take
-from frit.service.files import is_at, read_json, remove_torn, write_json
-from frit.service.jobs import State
+from frit.service.index import tokens
+from frit.service.jobs.engine import Engine, take
+from frit.service.jobs.processes import is_at, remove_torn
+from frit.service.jobs.states import State
+from frit.solver.durable import read_json, write_json
 
 
 def test_many_threads_write_one_file(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ import sqlalchemy as sa
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from frit.service import filters
-from frit.service.jobs import Job, NewJob, State
-from frit.service.problems import HttpError
-from frit.service.schema import jobs
-from frit.service.store import NewPoint, Store
+from frit.service.http import filters
+from frit.service.http.problems import HttpError
+from frit.service.index.records import NewPoint
+from frit.service.index.schema import jobs
+from frit.service.index.store import Store
+from frit.service.jobs.states import Job, NewJob, State
 from frit.solver.case import parse_case
 from frit.solver.variations import case_text, identity, written
 
@@ -239,12 +240,7 @@ def test_no_cursor_breaks_the_query(text: str) -> None:
 
 def plan(store: Store, *parameters: tuple[str, str]) -> str:
     """How SQLite goes about choosing the page."""
-    return plan_of(store, filters.native, *parameters)
-
-
-def plan_of(store: Store, index: Any, *parameters: tuple[str, str]) -> str:
-    """... with what `index` says there is."""
-    selection = filters.select(parameters, lambda name: 1, index)
+    selection = filters.select(parameters, lambda name: 1)
     query = sa.select(jobs.c.seq).where(selection.where).limit(51)
     query = query if selection.few else query.order_by(*selection.order)
     text = str(query.compile(dialect=sa.create_engine("sqlite://").dialect, compile_kwargs={"literal_binds": True}))
@@ -264,48 +260,10 @@ def test_what_sweeps_are_made_of_and_lead_to_is_found_by_an_index(store: Store, 
 def test_few_and_many_jobs_that_fit_are_found_alike(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     query = {"particles.mean_radius.ge": "9"}
     few = [job.seq for job in found(store, **query)]
-    monkeypatch.setattr("frit.service.store.FEW", 3)
+    monkeypatch.setattr("frit.service.index.queries.FEW", 3)
     assert [job.seq for job in found(store, **query)] == few
-    monkeypatch.setattr("frit.service.filters.NEAR", 2)
+    monkeypatch.setattr("frit.service.http.filters.NEAR", 2)
     assert [job.seq for job in found(store, **query)] == few
-
-
-def test_an_index_is_made_of_what_was_asked_for_and_the_oldest_goes(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def made() -> list[str]:
-        store.write(lambda t: None).result()  # behind what was asked for
-        with store.reading() as connection:
-            query = "SELECT name FROM sqlite_master WHERE name GLOB 'asked_*' ORDER BY rowid"
-            return [row.name for row in connection.exec_driver_sql(query)]
-
-    def index(scalar: filters.Scalar) -> bool:
-        return filters.native(scalar) or store.indexed(scalar.key, filters.sql_of(scalar))
-
-    def seqs() -> list[list[int]]:
-        queries = [
-            [("particles.seed.ge", "1")], [("priority.ne", "2"), ("order", "ended")], [("ended.gt", "0")],
-            [("particles.seed", "1"), ("priority", "2"), ("state", "succeeded")], [("order", "-particles.seed")],
-        ]  # fmt: skip
-        answers = []
-        for query in queries:
-            selection = filters.select(query, lambda name: 1, index)
-            value = None if selection.scalar is None else selection.scalar.sql
-            page = store.page(selection.where, selection.order, 50, value, selection.few, selection.near)
-            answers.append([job.seq for job, _ in page])
-        return answers
-
-    before = seqs()
-    assert made() == []  # of few jobs
-    monkeypatch.setattr("frit.service.store.FEW", 3)
-    monkeypatch.setattr("frit.service.store.ASKED", 3)
-    assert seqs() == before
-    assert made() == ["asked_particles.seed", "asked_priority", "asked_ended"]
-    assert seqs() == before
-    assert "asked_particles.seed" in plan_of(store, index, ("particles.seed.ge", "1"))
-    assert "asked_priority" in plan_of(store, index, ("priority.ne", "2"))
-    assert not store.indexed("attempt", '"attempt"')
-    assert made() == ["asked_particles.seed", "asked_priority", "asked_attempt"]
 
 
 def test_a_state_is_found_by_an_index_in_the_order_of_the_page(store: Store) -> None:

@@ -9,12 +9,12 @@ import pytest
 from indexing import LIMIT, done, new, started
 from serving import ended, new_job, settings, submit, until
 
-from frit.service.engine import Engine
-from frit.service.files import read_json, write_json
-from frit.service.jobs import Exit, Job, Move, State
-from frit.service.reindex import rebuild
-from frit.service.runner import advanced, checkpoint_in
-from frit.service.store import Store
+from frit.service.index.reindex import rebuild
+from frit.service.index.store import Store
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.runner import advanced, checkpoint_in
+from frit.service.jobs.states import Exit, Job, Move, State
+from frit.solver.durable import read_json, write_json
 
 
 def test_only_another_checkpoint_of_that_attempt_is_progress(tmp_path: Path) -> None:

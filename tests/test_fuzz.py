@@ -9,7 +9,7 @@ from engines import stand_in
 from fuzz import BLOCKED, SLOW, Found, Target, fire, target
 from nasty import KINDS, nasties
 
-from frit.service import tokens
+from frit.service.index import tokens
 
 SEED = 20
 GROWTH = 100_000_000  # bytes

@@ -18,7 +18,7 @@ import zarr
 from asking import LONG, PACKING, TINY, Tree, final, gmsh_text, listening, service, until
 from fastapi.testclient import TestClient
 
-from frit.service.store import Store
+from frit.service.index.store import Store
 from frit.solver import amounts, mesh_file
 from frit.solver.case import parse_case
 from frit.solver.geometry import lattice
@@ -351,7 +351,7 @@ def test_a_long_history_is_never_whole_in_memory(
 
     monkeypatch.setattr(Store, "history", watched)
     for few in (1, rows - 1):
-        monkeypatch.setattr("frit.service.delivery.ROWS", few)
+        monkeypatch.setattr("frit.service.http.delivery.ROWS", few)
         for kind, before in zip(kinds, whole, strict=True):
             answer = httpx2.get(url, headers={"Accept": kind})
             assert (answer.text, answer.headers["content-type"]) == (before.text, before.headers["content-type"])
@@ -560,7 +560,8 @@ def test_the_document_of_the_interface_is_complete(idle: TestClient) -> None:
     assert {path for path in paths if path.startswith("/v1")} == {
         "/v1/jobs", "/v1/jobs/{id}", "/v1/jobs/{id}/history", "/v1/jobs/{id}/log", "/v1/jobs/{id}/events",
         "/v1/jobs/{id}/snapshots", "/v1/jobs/{id}/snapshots.zarr/{path}", "/v1/jobs/{id}/cancel", "/v1/jobs/{id}/retry",
-        "/v1/sweeps", "/v1/sweeps/{id}", "/v1/sweeps/{id}/compare", "/v1/limits",
+        "/v1/jobs/{id}/rerun", "/v1/sweeps", "/v1/sweeps/{id}", "/v1/sweeps/{id}/compare", "/v1/sweeps/{id}/cancel",
+        "/v1/sweeps/{id}/retry", "/v1/files", "/v1/files/{id}", "/v1/plan", "/v1/schema", "/v1/events", "/v1/limits",
     }  # fmt: skip
     assert {"/livez", "/readyz", "/metrics"} <= paths.keys()
     for path, operations in paths.items():
@@ -571,7 +572,7 @@ def test_the_document_of_the_interface_is_complete(idle: TestClient) -> None:
                     assert response["content"].keys() == {"application/problem+json"}, (method, path, status)
             if path.startswith("/v1"):
                 assert {"401", "403"} <= operation["responses"].keys(), (method, path)
-    for name in ("JobSubmission", "SweepSubmission", "ProblemDetails"):
+    for name in ("JobSubmission", "SweepSubmission", "PlanRequest", "ProblemDetails"):
         assert document["components"]["schemas"][name]["examples"], name
 
 

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from frit.service.jobs import SENTENCES, TRANSITIONS, Job, Move, State, TransitionError, after
+from frit.service.jobs.states import SENTENCES, TRANSITIONS, Job, Move, State, TransitionError, after
 
 # For every state, the moves it allows and where they lead. All else is refused.
 ENDS = """

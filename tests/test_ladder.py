@@ -12,10 +12,10 @@ import pytest
 from serving import ended, in_state, new_job, settings, submit, until
 from soak import of_data
 
-from frit.service.engine import Engine
-from frit.service.jobs import Job, NewJob, State
-from frit.service.memory import LEAST, limits_of, memory_below, memory_per_core
-from frit.service.runner import NOTHING_TO_KEEP
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.memory import LEAST, limits_of, memory_below, memory_per_core
+from frit.service.jobs.runner import NOTHING_TO_KEEP
+from frit.service.jobs.states import Job, NewJob, State
 from frit.solver.case import parse_case
 
 GRACE = 1000.0  # seconds: who waits for one of these hangs

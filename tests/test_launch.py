@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from frit.service import launch
-from frit.service.launch import Launch, LaunchError
+from frit.service.jobs import launch
+from frit.service.jobs.launch import Launch, LaunchError
 
 STAND_IN = """
 import json, os, signal, sys, time

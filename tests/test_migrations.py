@@ -21,16 +21,18 @@ from alembic.runtime.migration import MigrationContext
 from indexing import done, is_whole, new, opened, rows
 from typer.testing import CliRunner
 
-from frit.service import cli, migrations
-from frit.service.engine import take
-from frit.service.jobs import State
-from frit.service.migrations import IndexVersionError
-from frit.service.schema import metadata
+from frit.service.cli import main as cli
+from frit.service.index import migrations
+from frit.service.index.migrations import IndexVersionError
+from frit.service.index.schema import metadata
+from frit.service.jobs.engine import take
+from frit.service.jobs.states import State
 from frit.solver.revision import FIRST
 
 NEWEST = migrations.versions(Path("there is none"))[1]
 
 OLD = Path(__file__).parent / "data" / "index-0001.sql"
+PROCESS = {"pid": "pid", "start": "pid_start", "boot": "boot"}
 TABLES = ["sweeps", "jobs", "sweep_jobs", "attempts", "history", "snapshots", "events", "tokens", "idempotency"]
 
 
@@ -72,16 +74,22 @@ def test_the_command_upgrades_it_and_keeps_every_row_and_a_copy(old: Path) -> No
     status, printed = frit("db", "upgrade", "--data", str(old))
     assert (status, printed) == (0, f"{path}: version {NEWEST}, was 0001, which is kept as {path}.0001\n")
     after = content(path)
-    assert [row.pop("duplicates") for row in after["sweeps"]] == [0, 0]
+    assert before == content(Path(f"{path}.0001"))
+    assert [(row.pop("duplicates"), row.pop("owner")) for row in after["sweeps"]] == [(0, None)] * 2
     tried = [row["attempt"] > 0 for row in before["jobs"]]
     assert set(tried) == {True, False}
     results = [json.loads(row["result"]) for row in after["jobs"]]
     assert [result.pop("revision", None) for result in results] == [FIRST if ran else None for ran in tried]
     for row, result in zip(after["jobs"], results, strict=True):
         row["result"] = json.dumps(result)
+        assert [row.pop(key) for key in ("owner", "origin", "bytes")] == [None] * 3
     for row in before["jobs"]:
         row["result"] = json.dumps(json.loads(row["result"]))
-    assert after == before == content(Path(f"{path}.0001"))
+    for row in (*before["attempts"], *after["attempts"]):
+        process = {name: row.pop(key, None) for name, key in PROCESS.items()}
+        row["handle"] = json.loads(row.get("handle") or json.dumps(process))
+    assert after == before
+    assert any(row["handle"]["pid"] for row in after["attempts"])
     assert (version(path), version(Path(f"{path}.0001"))) == (NEWEST, "0001")
     assert is_whole(path)
     assert frit("db", "upgrade", "--data", str(old)) == (0, f"{path}: version {NEWEST} already\n")
@@ -179,7 +187,7 @@ CHILD = """
 import sys
 from pathlib import Path
 from test_migrations import use
-from frit.service import migrations
+from frit.service.index import migrations
 use(Path(sys.argv[2]))
 migrations.upgrade(Path(sys.argv[1]))
 """

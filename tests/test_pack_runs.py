@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from launching import TIMEOUT, different, history, interrupted, launch, record, resume, solve
 
-from frit.service.launch import is_open_mpi, mpirun_command
+from frit.service.jobs.launch import is_open_mpi, mpirun_command
 from frit.solver import pack_store, particle_file
 from frit.solver.case import parse_case
 from frit.solver.packing import Packing, request
@@ -162,6 +162,6 @@ def test_frit_pack_refuses_what_cannot_be_packed(tmp_path: Path) -> None:
 
 
 def frit(folder: Path, *arguments: str) -> tuple[int, str, str]:
-    command = [sys.executable, "-P", "-c", "from frit.service.cli import main; main()", *arguments]
+    command = [sys.executable, "-P", "-c", "from frit.service.cli.main import main; main()", *arguments]
     ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     return ended.returncode, ended.stdout, ended.stderr

@@ -12,12 +12,12 @@ from indexing import LIMIT, attempted, claim, done, is_whole, lines, new, opened
 from launching import PAIR
 from typer.testing import CliRunner
 
-from frit.service import cli
-from frit.service.engine import Engine, EngineError, take
-from frit.service.files import write_json
-from frit.service.jobs import Move, NewJob, State
-from frit.service.reindex import rebuild
-from frit.service.store import Key, NewPoint
+from frit.service.cli import main as cli
+from frit.service.index.records import Key, NewPoint
+from frit.service.index.reindex import rebuild
+from frit.service.jobs.engine import Engine, EngineError, take
+from frit.service.jobs.states import Move, NewJob, State
+from frit.solver.durable import write_json
 
 TABLES = ["sweeps", "jobs", "sweep_jobs", "attempts", "history", "snapshots", "events", "idempotency"]
 
@@ -110,7 +110,7 @@ async def opened_again(data: Path) -> None:
     """An engine for a while, which finds nothing to do."""
     async with Engine(settings(data)) as engine:
         for _ in range(5):
-            await engine.hub.wait(0.1)
+            await engine.notifier.wait(0.1)
             assert not engine.scheduler.running
         assert engine.trouble() is None
 

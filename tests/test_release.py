@@ -13,15 +13,15 @@ from asking import TIMEOUT, TINY, free_port, until
 from serving import stand_in
 
 from frit.service.client import Client
-from frit.service.jobs import State
-from frit.service.store import Store
+from frit.service.index.store import Store
+from frit.service.jobs.states import State
 
 
 @pytest.mark.parametrize("how", ["option", "setting"])
 def test_term_releases_the_jobs_even_while_somebody_listens(tmp_path: Path, how: str) -> None:
     data, port = tmp_path / "data", free_port()
-    command = [sys.executable, "-P", "-c", "from frit.service.cli import main; main()", "serve", "--data", str(data)]
-    command += ["--port", str(port), "--cores", "1", *(["--release"] if how == "option" else [])]
+    command = [sys.executable, "-P", "-c", "from frit.service.cli.main import main; main()", "serve"]
+    command += ["--data", str(data), "--port", str(port), "--cores", "1", *(["--release"] if how == "option" else [])]
     environment = {**os.environ, "FRIT_MPIRUN": stand_in(tmp_path), "FRIT_FREE_DISK": "0", "FRIT_GRACE": "20"}
     environment |= {"FRIT_RELEASE": "1"} if how == "setting" else {}
     url = f"http://127.0.0.1:{port}"

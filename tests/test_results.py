@@ -8,10 +8,10 @@ import pytest
 from engines import finished, job, settings, stand_in, submit, until
 from launching import PAIR
 
-from frit.service.engine import Engine
-from frit.service.jobs import Move, State
-from frit.service.results import Reader
-from frit.service.runner import read_exit
+from frit.service.index.results import Reader
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.runner import read_exit
+from frit.service.jobs.states import Move, State
 
 
 def row(time: float) -> str:

@@ -15,13 +15,15 @@ import pytest
 from serving import ended, in_state, new_job, settings, submit, until
 from soak import of_data
 
-from frit.service.backends.local import BackendError, LocalBackend
-from frit.service.engine import Engine
-from frit.service.files import read_json, start_of, write_json
-from frit.service.jobs import Job, Move, State
-from frit.service.launch import Outcome
-from frit.service.runner import Order, judge, read_exit
-from frit.service.store import Store
+from frit.service.index.store import Store
+from frit.service.jobs.backends.local import LocalBackend
+from frit.service.jobs.backends.protocol import BackendError
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.launch import Outcome
+from frit.service.jobs.processes import start_of
+from frit.service.jobs.runner import Order, judge, read_exit
+from frit.service.jobs.states import Job, Move, State
+from frit.solver.durable import read_json, write_json
 
 
 @pytest.mark.parametrize(
@@ -194,7 +196,7 @@ ENGINE = """
 import asyncio, sys
 sys.path.insert(0, sys.argv[2])
 from serving import settings
-from frit.service.engine import Engine
+from frit.service.jobs.engine import Engine
 
 async def main():
     async with Engine(settings(sys.argv[1])):
@@ -219,7 +221,7 @@ def test_runners_outlive_the_service_and_are_adopted(tmp_path: Path, how: signal
             long = engine.store.job(jobs[0].id)
             assert (long.state, long.attempt, runner_pid(engine, long)) == (State.RUNNING, 1, pid)
             async with asyncio.timeout(120.0):  # for hangs; a core is free an instant after its job has ended
-                while len(engine.scheduler.free) != 1:
+                while engine.scheduler.backend.free != 1:
                     await asyncio.sleep(0.005)
             await engine.cancel(long.id)
             (long,) = await ended(engine, long)
@@ -281,26 +283,26 @@ def test_a_run_whose_end_was_not_told_is_not_run_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("standing_in")
-def test_one_runner_per_run_directory_and_a_nursery_that_may_die(tmp_path: Path) -> None:
+def test_one_runner_per_run_directory_and_a_fork_server_that_may_die(tmp_path: Path) -> None:
     async def main() -> None:
-        backend = LocalBackend()
+        backend = LocalBackend(2)
         orders = []
         for k in range(2):
             directory = tmp_path / f"run{k}"
             directory.mkdir()
             (directory / "submitted.json").write_text(json.dumps({"name": "sleep 30"}))
             orders.append(Order(1, str(directory), 1, (os.sched_getaffinity(0).pop(),), None, 5.0, 10**10))
-        pid = await backend.start(orders[0])
+        pid = ((await backend.start(orders[0])) or {})["pid"]
         with pytest.raises(BackendError, match="a runner is there already"):
             await backend.start(orders[0])
-        assert backend._nursery is not None
-        backend._nursery[0].kill()
-        backend._nursery[0].wait()
+        assert backend._fork_server is not None
+        backend._fork_server[0].kill()
+        backend._fork_server[0].wait()
         assert psutil.pid_exists(pid)
-        other = await backend.start(orders[1])  # by a new nursery
+        other = ((await backend.start(orders[1])) or {})["pid"]  # by a new fork server
         for order in orders:
             directory = Path(order.directory)
-            assert (await backend.recorded(directory, 1) or {})["pid"] in (pid, other)
+            assert (await backend.find(directory, 1) or {})["pid"] in (pid, other)
             while not (directory / "calls").exists():
                 await asyncio.sleep(0.01)
             write_json(directory / "request.json", {"attempt": 1, "stop": "cancelled"})
@@ -317,17 +319,19 @@ def test_one_runner_per_run_directory_and_a_nursery_that_may_die(tmp_path: Path)
 
 @pytest.mark.usefixtures("standing_in")
 def test_a_runner_whose_birth_was_not_told_is_watched(tmp_path: Path) -> None:
-    """The nursery is killed after the fork and before its answer."""
+    """The fork server is killed after the fork and before its answer."""
 
     async def main() -> None:
         async with Engine(settings(tmp_path / "data", attempts=1)) as engine:
-            fork = engine.scheduler.backend._fork
+            backend = engine.scheduler.backend
+            assert isinstance(backend, LocalBackend)
+            fork = backend._fork
 
             async def mute(order: Order, lock: int) -> int:
                 await fork(order, lock)
                 raise EOFError("it has died")
 
-            with patch.object(engine.scheduler.backend, "_fork", mute):
+            with patch.object(backend, "_fork", mute):
                 (job,) = await ended(engine, *await submit(engine, new_job("sleep 0.2")))
             assert (job.state, job.attempt) == (State.SUCCEEDED, 1)
 

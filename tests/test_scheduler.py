@@ -12,12 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from serving import ended, in_state, new_job, settings, submit, until
 
-from frit.service.engine import Engine, EngineError
-from frit.service.jobs import State
-from frit.service.scheduler import Scheduler, choose
+from frit.service.jobs.backends.local import LocalBackend, choose
+from frit.service.jobs.engine import Engine, EngineError
+from frit.service.jobs.scheduler import Scheduler
+from frit.service.jobs.states import State, Waiting
 from frit.service.settings import own_cores
 
-queues = st.lists(st.integers(1, 9), max_size=20).map(lambda ranks: list(enumerate(ranks)))
+queues = st.lists(st.integers(1, 9), max_size=20).map(lambda found: [Waiting(k, r) for k, r in enumerate(found)])
 
 
 # --- the choice -------------------------------------------------------------------------------------------
@@ -25,9 +26,9 @@ queues = st.lists(st.integers(1, 9), max_size=20).map(lambda ranks: list(enumera
 
 @given(queue=queues, free=st.integers(0, 8), more=st.integers(0, 4), overtake=st.booleans())
 def test_a_choice_fits_and_keeps_the_order(
-    queue: list[tuple[int, int]], free: int, more: int, overtake: bool
+    queue: list[Waiting], free: int, more: int, overtake: bool
 ) -> None:
-    total, ranks, asked = free + more, dict(queue), list[int]()
+    total, ranks, asked = free + more, {job.seq: job.ranks for job in queue}, list[int]()
 
     def ask(seq: int) -> bool:
         asked.append(seq)
@@ -37,7 +38,7 @@ def test_a_choice_fits_and_keeps_the_order(
     assert sum(ranks[seq] for seq in chosen) <= free
     assert chosen == sorted(set(chosen))
     # Only the first that did not fit is asked about; before it everybody that could ever run was taken.
-    possible = [seq for seq, r in queue if r <= total]
+    possible = [job.seq for job in queue if job.ranks <= total]
     left = [seq for seq in possible if seq not in chosen]
     assert asked == left[:1]
     if left and not overtake:
@@ -48,7 +49,7 @@ def test_a_choice_fits_and_keeps_the_order(
 
 
 def test_a_job_larger_than_all_cores_blocks_nobody() -> None:
-    assert choose([(1, 3), (2, 1), (3, 2)], 2, 2, lambda _: False) == [2]
+    assert choose([Waiting(1, 3), Waiting(2, 1), Waiting(3, 2)], 2, 2, lambda _: False) == [2]
 
 
 # --- an engine --------------------------------------------------------------------------------------------
@@ -135,7 +136,7 @@ def test_a_tick_costs_one_query(tmp_path: Path) -> None:
             await in_state(engine, running, State.RUNNING)
             await submit(engine, *(new_job("sleep 0", 0.001 * k) for k in range(1, 50)))
             statements: list[str] = []
-            for database in (engine.store._reader, engine.store._writer):
+            for database in (engine.store._reader, engine.store._engine):
                 sa.event.listen(database, "before_cursor_execute", lambda *a: statements.append(a[2]))
             ask = engine.store._ask
 
@@ -145,11 +146,12 @@ def test_a_tick_costs_one_query(tmp_path: Path) -> None:
 
             engine.store._ask = asked  # type: ignore[method-assign]
             own = engine.scheduler  # another one beside it, which nobody runs
-            idle = Scheduler(own.settings, engine.store, engine.hub, own.backend, own.follower)
-            idle.free = set()
+            cores = LocalBackend(1)
+            idle = Scheduler(own.settings, engine.store, engine.notifier, cores, own.follower)
+            cores.spare = set()
             await idle.tick()
             assert statements == []
-            idle.free = {0}
+            cores.spare = {0}
             with (
                 patch.object(engine.store, "claim", side_effect=LookupError("asked for a claim")),
                 pytest.raises(LookupError),

@@ -11,10 +11,11 @@ import pytest
 import schemathesis
 from asking import PACKING, TINY, listening, settings_in
 from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
 from schemathesis.checks import not_a_server_error
 
-from frit.service import tokens
-from frit.service.app import create_app
+from frit.service.http.app import create_app
+from frit.service.index import tokens
 
 SWEEP = {"name": "s", "base": PACKING, "axes": {"particles.mean_radius": [8.0, 10.0]}}
 
@@ -38,6 +39,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield found
 
 
+schemathesis.openapi.media_type("application/octet-stream", st.just(b"6.5,6.2,5.0\n"))  # a file that is taken
 schema = schemathesis.openapi.from_dict(create_app(settings_in(Path("unused"))).openapi())
 
 
@@ -81,7 +83,7 @@ def is_file(content: Any) -> bool:
     return known and isinstance(content.get("content"), str) and content.get("encoding", "text") in ("text", "base64")
 
 
-@schema.parametrize()
+@schema.exclude(path="/v1/events").parametrize()  # an answer that has no end; test_verbs.py has it
 @settings(
     max_examples=10, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate],
     suppress_health_check=list(HealthCheck),

@@ -14,11 +14,13 @@ from asking import TINY, Process, listening, service
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from frit.service import commands_token, tokens
-from frit.service.delivery import open_beneath
-from frit.service.security import AddressError, check_address, is_loopback
+from frit.service.cli import token as commands_token
+from frit.service.http.delivery import open_beneath
+from frit.service.http.security import AddressError, check_address, is_loopback
+from frit.service.index import tokens
+from frit.service.index.records import NotFoundError, StoreError
+from frit.service.index.store import Store
 from frit.service.settings import Settings
-from frit.service.store import NotFoundError, Store, StoreError
 
 JOB = {"case": TINY}
 

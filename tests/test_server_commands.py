@@ -45,7 +45,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def command(*words: str) -> list[str]:
-    return [sys.executable, "-P", "-c", "from frit.service.cli import main; main()", *words]
+    return [sys.executable, "-P", "-c", "from frit.service.cli.main import main; main()", *words]
 
 
 def frit(*words: str, status: int = 0) -> str:

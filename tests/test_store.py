@@ -19,11 +19,13 @@ import pytest
 import sqlalchemy as sa
 from indexing import LIMIT, attempted, claim, done, ended, is_whole, lines, new, opened, points, started
 
-from frit.service import store as store_module
-from frit.service.hub import Hub
-from frit.service.jobs import Exit, Job, Move, State, TransitionError
-from frit.service.schema import jobs as table
-from frit.service.store import Key, KeyReusedError, NewPoint, NotFoundError, Store, StoreError, Transaction
+from frit.service.index import writer as writer_module
+from frit.service.index.records import Key, KeyReusedError, NewPoint, NotFoundError, StoreError
+from frit.service.index.schema import jobs as table
+from frit.service.index.store import Store
+from frit.service.index.writer import Transaction
+from frit.service.jobs.notifier import Notifier
+from frit.service.jobs.states import Exit, Job, Move, State, TransitionError
 
 
 @pytest.fixture(scope="session")
@@ -143,7 +145,7 @@ def test_many_writers_share_transactions_and_each_gets_its_own_answer(store: Sto
     assert [job.name for job in made] == [f"job {k}" for k in range(400)]
     assert sorted(job.seq for job in made) == list(range(1, 401))
     assert len(commits) < 400
-    assert {line["seq"] for line in lines(store.journal)} == set(range(1, 401))
+    assert {line["seq"] for line in lines(store.journal.path)} == set(range(1, 401))
 
 
 BAD = {
@@ -182,7 +184,7 @@ def test_what_a_bad_piece_of_work_did_is_undone_and_not_noted(store: Store) -> N
     with pytest.raises(ValueError, match=r"^no$"):
         done(wrong)
     assert store.job(new(0).identity[:16]).name == "job 0"
-    assert [line["seq"] for line in lines(store.journal)] == [1, 2]
+    assert [line["seq"] for line in lines(store.journal.path)] == [1, 2]
 
 
 def test_who_does_not_wait_any_more_is_not_served_and_stops_nobody(store: Store) -> None:
@@ -204,8 +206,8 @@ def test_who_does_not_wait_any_more_is_not_served_and_stops_nobody(store: Store)
 
 
 def test_a_listener_whose_loop_is_closed_stops_nobody(store: Store) -> None:
-    async def make() -> Hub:
-        return Hub()
+    async def make() -> Notifier:
+        return Notifier()
 
     store.listeners.append(asyncio.run(make()).notify)
     assert done(store.submit(new(1))).seq == 1
@@ -230,26 +232,26 @@ def test_claims_are_exclusive(store: Store) -> None:
 
 def test_where_the_journal_cannot_be_written_nothing_is_done(store: Store) -> None:
     first = done(store.submit(new(1)))
-    before = store.journal.read_bytes()
-    store.journal.unlink()
-    store.journal.mkdir()
+    before = store.journal.path.read_bytes()
+    store.journal.path.unlink()
+    store.journal.path.mkdir()
     with pytest.raises(StoreError, match="directory"):
         done(store.submit(new(2)))
-    store.journal.rmdir()
-    store.journal.write_bytes(before)
+    store.journal.path.rmdir()
+    store.journal.path.write_bytes(before)
     assert [job.id for job in store.jobs()] == [first.id]
     assert done(store.submit(new(2))).seq == 2
-    assert [line["seq"] for line in lines(store.journal)] == [1, 2]
+    assert [line["seq"] for line in lines(store.journal.path)] == [1, 2]
 
 
 def test_where_the_database_cannot_be_written_the_journal_is_as_before(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done(store.submit(new(1)))
-    before = store.journal.read_bytes()
+    before = store.journal.path.read_bytes()
     refused: list[None] = []
 
-    @sa.event.listens_for(store._writer, "commit")
+    @sa.event.listens_for(store._engine, "commit")
     def fail(_: object) -> None:
         if not refused:
             refused.append(None)
@@ -257,24 +259,24 @@ def test_where_the_database_cannot_be_written_the_journal_is_as_before(
 
     with pytest.raises(StoreError, match="disk I/O error"):
         done(store.submit(new(2)))
-    assert store.journal.read_bytes() == before
+    assert store.journal.path.read_bytes() == before
     assert [job.seq for job in store.jobs()] == [1]
     assert done(store.submit(new(2))).seq == 2
 
 
 def test_a_line_torn_by_a_crash_spoils_no_other(store: Store) -> None:
     done(store.submit(new(1)))
-    with open(store.journal, "a") as file:
+    with open(store.journal.path, "a") as file:
         file.write('{"kind": "job", "se')
     done(store.submit(new(2)))
-    first, torn, second = store.journal.read_text().splitlines()
+    first, torn, second = store.journal.path.read_text().splitlines()
     assert (json.loads(first)["seq"], json.loads(second)["seq"]) == (1, 2)
     assert torn == '{"kind": "job", "se'
-    store.journal.write_text(first + "\n" + second + "\n")
+    store.journal.path.write_text(first + "\n" + second + "\n")
 
 
 def test_a_foreign_lock_is_waited_for_and_then_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_module, "BUSY", 0.2)
+    monkeypatch.setattr(writer_module, "BUSY", 0.2)
     with opened(tmp_path) as store:
         done(store.submit(new(1)))
         with closing(sqlite3.connect(store.path, isolation_level=None)) as foreign:
@@ -285,7 +287,7 @@ def test_a_foreign_lock_is_waited_for_and_then_told(tmp_path: Path, monkeypatch:
             waiting = store.submit(new(3))
             foreign.execute("ROLLBACK")
             assert done(waiting).seq == 2
-        assert len(lines(store.journal)) == 2
+        assert len(lines(store.journal.path)) == 2
 
 
 # --- the life of a job ------------------------------------------------------------------------------------
@@ -309,7 +311,7 @@ def test_the_same_case_again_is_another_job_with_a_number(store: Store) -> None:
 def test_start_and_finish_told_twice_count_once(store: Store) -> None:
     job = claim(store, done(store.submit(new(1))))
     for _ in range(2):
-        running = done(store.start(job.id, 1, 11, 12, "b"))
+        running = done(store.start(job.id, 1, {"pid": 11}))
     assert running.state is State.RUNNING
     for _ in range(2):
         over = ended(store, job, Move.SUCCEED)
@@ -317,14 +319,14 @@ def test_start_and_finish_told_twice_count_once(store: Store) -> None:
     assert ended(store, job, Move.BREAK).state is State.SUCCEEDED
     assert [event.state for event in store.events(job.id)] == ["queued", "starting", "running", "succeeded"]
     (attempt,) = store.attempts(job.id)
-    assert (attempt.pid, attempt.pid_start, attempt.boot, attempt.cores) == (11, 12, "b", (0,))
+    assert (attempt.handle, attempt.cores) == ({"pid": 11}, (0,))
     assert (attempt.state, attempt.ended, attempt.core_seconds) == ("succeeded", 2000.0, 10.0)
 
 
 def test_word_of_another_attempt_is_ignored(store: Store) -> None:
     job = claim(store, done(store.submit(new(1))))
     for attempt in (0, 2):
-        assert done(store.start(job.id, attempt, 1, 2, "b")).state is State.STARTING
+        assert done(store.start(job.id, attempt, {"pid": 1})).state is State.STARTING
         assert done(store.finish(job.id, Exit(attempt, Move.SUCCEED, None, 1.0), LIMIT)).state is State.STARTING
     assert not done(store.requeue(job.id, 0)).retrying
 
@@ -412,7 +414,7 @@ def test_what_goes_on_or_went_well_is_not_retried(store: Store, state: str) -> N
 
 
 def test_no_such_job(store: Store) -> None:
-    for ask in (store.cancel, store.retry, lambda i: store.requeue(i, 1), lambda i: store.start(i, 1, 1, 1, "")):
+    for ask in (store.cancel, store.retry, lambda i: store.requeue(i, 1), lambda i: store.start(i, 1, {})):
         with pytest.raises(NotFoundError, match="'nobody'"):
             done(ask("nobody"))
     for look in (store.job, store.attempts, store.events, store.history, store.snapshots, store.sweep):
@@ -426,10 +428,10 @@ def test_no_such_job(store: Store) -> None:
 def test_the_queue_is_by_priority_then_age(store: Store) -> None:
     for k, priority in enumerate([0, 5, 0, -1, 5]):
         done(store.submit(new(k, priority=priority, ranks=k + 1)))
-    assert store.queued(10) == [(2, 2), (5, 5), (1, 1), (3, 3), (4, 4)]
-    assert store.queued(2) == [(2, 2), (5, 5)]
+    assert [job.seq for job in store.queued(10)] == [2, 5, 1, 3, 4]
+    assert [job.ranks for job in store.queued(2)] == [2, 5]
     claim(store, store.job(new(1).identity[:16]))
-    assert store.queued(1) == [(5, 5)]
+    assert [job.seq for job in store.queued(1)] == [5]
 
 
 def test_the_queue_is_read_from_its_index(store: Store) -> None:
@@ -447,7 +449,7 @@ def test_what_an_earlier_service_left(store: Store) -> None:
     attempted(store, pausing, Move.LOSE)
     attempted(store, over, Move.FAIL)
     active, waiting = store.unfinished()
-    assert {(job.id, attempt.number, attempt.pid) for job, attempt in active} == {
+    assert {(job.id, attempt.number, (attempt.handle or {}).get("pid")) for job, attempt in active} == {
         (up.id, 1, None), (busy.id, 1, 4711)
     }  # fmt: skip
     assert [job.id for job in waiting] == [pausing.id]

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
 from indexing import LIMIT, done, is_whole, new, points, rows
 
-from frit.service.jobs import Exit, Move, TransitionError
-from frit.service.reindex import rebuild
-from frit.service.store import Store
+from frit.service.index.reindex import rebuild
+from frit.service.index.store import Store
+from frit.service.jobs.states import Exit, Move, TransitionError
 
 NUMBERS = st.integers(0, 4)
 ENDS = {
@@ -111,7 +111,7 @@ class Index(RuleBasedStateMachine):
     @rule(one=ids, late=st.sampled_from([0, 0, 0, 1]))
     def start(self, one: str, late: int) -> None:
         job = self.jobs[one]
-        done(self.store.start(one, job.attempt - late, 1, 2, "boot"))
+        done(self.store.start(one, job.attempt - late, {"pid": 1}))
         if job.state == "starting" and not late:
             job.go("running")
 

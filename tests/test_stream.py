@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from indexing import done, new, opened
 
-from frit.service.hub import Hub
+from frit.service.http.stream import events
+from frit.service.index.store import Store
+from frit.service.jobs.notifier import Notifier
 from frit.service.settings import Settings
-from frit.service.store import Store
-from frit.service.stream import events
 
 LOOK = 0.005  # seconds of the processor that a look of these tests takes
 
@@ -20,7 +20,7 @@ class Slow:
     """What a follower needs of an engine; every look at the index keeps the loop waiting."""
 
     def __init__(self, store: Store, folder: Path) -> None:
-        self.store, self.hub, self.settings = store, Hub(), Settings(data=folder)
+        self.store, self.notifier, self.settings = store, Notifier(), Settings(data=folder)
 
     def progress(self, _: str) -> dict[str, Any] | None:
         """None yet."""
@@ -45,7 +45,7 @@ async def longest_wait(store: Store, folder: Path, job: str, followers: int) -> 
     tasks = [asyncio.create_task(follow()) for _ in range(followers)]
     longest, end = 0.0, time.monotonic() + 1.0
     while (now := time.monotonic()) < end:
-        engine.hub.notify()
+        engine.notifier.notify()
         await asyncio.sleep(0.001)
         longest = max(longest, time.monotonic() - now)
     for task in tasks:
@@ -65,15 +65,15 @@ def test_a_hundred_followers_leave_the_loop_to_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize("passes", range(6))
 def test_a_follower_that_is_woken_and_cancelled_at_once_ends(passes: int) -> None:
     async def try_it() -> bool:
-        hub = Hub()
+        notifier = Notifier()
 
         async def follow() -> None:
             while True:
-                await hub.wait(60.0)
+                await notifier.wait(60.0)
 
         task = asyncio.create_task(follow())
         await asyncio.sleep(0.01)
-        hub.notify()
+        notifier.notify()
         for _ in range(passes):
             await asyncio.sleep(0)
         task.cancel()

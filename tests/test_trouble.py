@@ -15,11 +15,11 @@ from engines import finished, job, runs_of, settings, stand_in, submit, until
 from indexing import is_whole
 from launching import PAIR
 
-from frit.service import store as store_module
-from frit.service.engine import Engine, EngineError
-from frit.service.files import try_lock
-from frit.service.jobs import Job, State
-from frit.service.store import StoreError
+from frit.service.index import writer as writer_module
+from frit.service.index.records import StoreError
+from frit.service.jobs.engine import Engine, EngineError
+from frit.service.jobs.processes import try_lock
+from frit.service.jobs.states import Job, State
 
 ROOM = 2_000_000  # bytes that must be free for a job to be started
 LIBRARIES = Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")
@@ -183,7 +183,7 @@ def test_a_foreign_lock_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     hold = script.with_name("hold")
     hold.touch()
     monkeypatch.setenv("FRIT_MPIRUN", str(script))
-    monkeypatch.setattr(store_module, "BUSY", 0.2)
+    monkeypatch.setattr(writer_module, "BUSY", 0.2)
 
     async def serve() -> None:
         async with Engine(settings(tmp_path / "data")) as engine:

@@ -22,13 +22,13 @@ from fastapi.testclient import TestClient
 from serving import PAIR, ended, settings
 from serving import submit as submit_to
 
-from frit.service.engine import Engine
-from frit.service.jobs import Job, NewJob, State
-from frit.service.problems import HttpError
+from frit.service.http.problems import HttpError
+from frit.service.http.sniffing import HDF5, UnknownFileError, kind_of
+from frit.service.http.uploads import Shelf
+from frit.service.http.views import FileContent
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.states import Job, NewJob, State
 from frit.service.settings import Settings
-from frit.service.sniffing import HDF5, UnknownFileError, kind_of
-from frit.service.uploads import Shelf
-from frit.service.views import FileContent
 from frit.solver import mesh_file
 from frit.solver.case import parse_case
 from frit.solver.geometry import MeshError, file_mesh, lattice
@@ -389,7 +389,7 @@ def test_what_is_looked_for_in_a_head_is_found_in_a_moment(head: bytes) -> None:
     """A process that hangs here would hang the service; it is given twenty seconds, where it needs none."""
     code = """if True:
         import resource, sys
-        from frit.service.sniffing import UnknownFileError, kind_of
+        from frit.service.http.sniffing import UnknownFileError, kind_of
         resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
         try:
             kind_of(sys.stdin.buffer.read())

@@ -16,14 +16,16 @@ import pytest
 from serving import ended, in_state, new_job, settings, submit, until
 from soak import of_data
 
-from frit.service.backends import local
-from frit.service.backends.local import LocalBackend
-from frit.service.engine import Engine
-from frit.service.files import boot, read_json, start_of, try_lock
-from frit.service.jobs import Exit, Job, State
-from frit.service.metrics import Jobs
-from frit.service.runner import Order
-from frit.service.store import Store
+from frit.service.http.metrics import Jobs
+from frit.service.index.store import Store
+from frit.service.jobs.backends import local
+from frit.service.jobs.backends.local import LocalBackend
+from frit.service.jobs.backends.protocol import Handle
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.processes import boot, start_of, try_lock
+from frit.service.jobs.runner import Order
+from frit.service.jobs.states import Exit, Job, State
+from frit.solver.durable import read_json
 
 REASON = "its run folder was deleted, moved away or replaced while it had cores"
 
@@ -73,7 +75,7 @@ async def is_lost_for_good(engine: Engine, job: Job, runner: int) -> None:
     assert (job.state, job.message, job.attempt, job.retrying) == (State.LOST, REASON, 1, False)
     assert not lives(runner)
     assert not of_data(engine.settings.data)
-    assert engine.scheduler.free == {0}
+    assert engine.scheduler.backend.free == 1
     (after,) = await ended(engine, *await submit(engine, new_job("sleep 0", 0.2)))
     assert after.state is State.SUCCEEDED
     assert engine.trouble() is None
@@ -160,16 +162,17 @@ def test_under_a_starting_job(tmp_path: Path, when: str) -> None:
             backend, pids = engine.scheduler.backend, list[int]()
             start = backend.start
 
-            async def cut(order: Order) -> int:
+            async def cut(order: Order) -> Handle | None:
                 if when == "before":
                     shutil.rmtree(order.directory)
-                pids.append(await start(order))
+                if (handle := await start(order)) is not None:
+                    pids.append(handle["pid"])
                 if when == "after":
                     os.kill(pids[0], signal.SIGSTOP)
                     shutil.rmtree(order.directory, ignore_errors=True)
                     shutil.rmtree(order.directory, ignore_errors=True)
                     os.kill(pids[0], signal.SIGCONT)
-                return pids[0]
+                return handle
 
             with patch.object(backend, "start", cut):
                 (job,) = await ended(engine, *await submit(engine, new_job("deaf 100")))
@@ -217,8 +220,9 @@ def test_a_reused_pid_is_never_hit(tmp_path: Path) -> None:
     """The process is another's, as its start tells."""
     pid = os.getpid()
     other = local.Process(pid, (start_of(pid) or 0) - 1, boot())
-    asyncio.run(LocalBackend().clear(tmp_path / "run", other))
-    asyncio.run(LocalBackend().clear(tmp_path / "run", local.Process(pid, start_of(pid) or 0, "another boot")))
+    another = local.Process(pid, start_of(pid) or 0, "another boot")
+    asyncio.run(LocalBackend(1).clear(tmp_path / "run", other._asdict()))
+    asyncio.run(LocalBackend(1).clear(tmp_path / "run", another._asdict()))
 
 
 # --- watches that fail ------------------------------------------------------------------------------------
@@ -265,7 +269,7 @@ def test_a_start_that_fails_counts_as_an_attempt(tmp_path: Path) -> None:
         async with Engine(settings(tmp_path / "data", cores=1, attempts=2)) as engine:
             start = engine.scheduler.backend.start
 
-            async def cut(order: Order) -> int:
+            async def cut(order: Order) -> Handle | None:
                 if "says-no" in (Path(order.directory) / "submitted.json").read_text():
                     raise TypeError("of all things")
                 return await start(order)
@@ -275,7 +279,7 @@ def test_a_start_that_fails_counts_as_an_attempt(tmp_path: Path) -> None:
                 jobs = await ended(engine, *jobs)
             assert [job.state for job in jobs] == [State.ERROR, State.SUCCEEDED]
             assert jobs[0].message == "its start failed: TypeError: of all things"
-            assert engine.scheduler.free == {0}
+            assert engine.scheduler.backend.free == 1
 
     asyncio.run(main())
 
@@ -296,7 +300,7 @@ def test_a_job_that_is_no_more_in_the_index_gives_its_cores_back(tmp_path: Path)
 
             await asyncio.to_thread(forget, engine.store)
             os.kill(runner_of(engine, job), signal.SIGKILL)
-            await until(engine, lambda: engine.scheduler.free == {0})
+            await until(engine, lambda: engine.scheduler.backend.free == 1)
 
     asyncio.run(main())
 
@@ -312,7 +316,7 @@ def test_what_cannot_be_read_holds_no_cores(tmp_path: Path) -> None:
             (engine.run_directory(job.id) / "history.jsonl").mkdir()
             (job,) = await ended(engine, job)
             assert job.state is State.SUCCEEDED
-            assert engine.scheduler.free == {0}
+            assert engine.scheduler.backend.free == 1
 
     asyncio.run(main())
 

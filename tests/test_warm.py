@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from simulate import merged
 
-from frit.service.launch import mpirun_command
+from frit.service.jobs.launch import mpirun_command
 from frit.solver import jit, warm
 from frit.solver.case import parse_case
 

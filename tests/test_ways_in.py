@@ -14,10 +14,11 @@ from asking import LONG, TINY, free_port, listening, service, settings_in, until
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from frit.service import commands_token, tokens
-from frit.service.app import create_app
-from frit.service.engine import check
-from frit.service.reindex import rebuild
+from frit.service.cli import token as commands_token
+from frit.service.http.app import create_app
+from frit.service.http.security import check
+from frit.service.index import tokens
+from frit.service.index.reindex import rebuild
 from frit.service.settings import Settings
 
 JOB = {"case": TINY}

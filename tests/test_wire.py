@@ -13,7 +13,8 @@ import psutil
 import pytest
 from asking import TINY, listening
 
-from frit.service import tokens, wire
+from frit.service.http import wire
+from frit.service.index import tokens
 
 MEGABYTE = 1_000_000
 

@@ -22,10 +22,11 @@ import httpx2
 from asking import PACKING, Process
 from soak import of_data, soak
 
-from frit.service.engine import Engine
-from frit.service.jobs import Job, NewJob, State
+from frit.service.index.records import NewPoint
+from frit.service.index.store import Store
+from frit.service.jobs.engine import Engine
+from frit.service.jobs.states import Job, NewJob, State
 from frit.service.settings import Settings
-from frit.service.store import NewPoint, Store
 from frit.solver.case import parse_case
 from frit.solver.variations import case_text, identity, written
 from frit.sweeps.definition import parse_sweep
@@ -212,7 +213,7 @@ def no_op(count: int = 500, cores: int = 16) -> None:
             made = [engine.store.submit(new_job(number, dice)) for number in range(count)]
             await asyncio.gather(*map(asyncio.wrap_future, made))
             start, engine.scheduler.open = time.perf_counter(), True
-            engine.hub.notify()
+            engine.notifier.notify()
             while engine.store.count(State.SUCCEEDED) < count:
                 await asyncio.sleep(0.05)
             return time.perf_counter() - start

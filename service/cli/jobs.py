@@ -1,0 +1,257 @@
+"""Commands about jobs on a service: submit, jobs, show, log, cancel, retry, rerun, change, rm, gc."""
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from frit.solver.characters import visible
+
+from .speaking import HERE, JobId, Secret, Url, row, speaking, tell, tell_rows
+from .terminal import AsJson, Recompute, SweepFile, refuse, show_table
+
+if TYPE_CHECKING:
+    from ..client import Client
+    from ..remote import RemoteJob
+
+SWEEP = re.compile(r"s[0-9]+")
+SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
+BYTES = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
+ENDED = ("succeeded", "failed", "cancelled", "timed_out", "error", "lost")
+
+
+def submit(
+    file: SweepFile,
+    ranks: Annotated[int | None, typer.Option(metavar="N", min=1, help="MPI ranks of a job.")] = None,
+    name: Annotated[str | None, typer.Option(help="Default: the case's own.")] = None,
+    priority: Annotated[int | None, typer.Option(help="Higher comes first; default 0.")] = None,
+    tag: Annotated[list[str] | None, typer.Option(help="May be given several times.")] = None,
+    time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Wall-clock time of an attempt.")] = None,
+    recompute: Recompute = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Stay to the end; exit status 1 unless all succeed.")] = False,
+    url: Url = HERE,
+    token: Secret = None,
+    as_json: AsJson = False,
+) -> None:
+    """Submit a case or a sweep to a service."""
+    from ..remote import RemoteJob
+
+    options = {"ranks": ranks, "name": name, "priority": priority, "tags": tag or None, "time_limit": time_limit}
+    with speaking(url, token, str(file)) as client:
+        given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
+        submitted = client.submit(file, recompute=recompute, **given)
+        if wait:
+            submitted.wait()
+        found = [submitted] if isinstance(submitted, RemoteJob) else list(submitted.jobs())
+        if as_json:
+            typer.echo(json.dumps(submitted.data, indent=2))
+        else:
+            typer.echo(submitted.id)
+            if wait:
+                show_table([row(job) for job in found])
+        if wait and any(job.state != "succeeded" for job in found):
+            raise typer.Exit(1)
+
+
+def jobs(
+    where: Annotated[list[str] | None, typer.Argument(metavar="[FILTER]...", help="As state=running.")] = None,
+    limit: Annotated[int, typer.Option(metavar="N", min=1, help="Rows, at most.")] = 50,
+    url: Url = HERE,
+    token: Secret = None,
+    as_json: AsJson = False,
+) -> None:
+    """List jobs, newest first; filters as in HTTP: state=queued particles.mean_radius.ge=9 order=name sweep=s1."""
+    filters = dict(word.split("=", 1) for word in where or () if "=" in word)
+    if wrong := [word for word in where or () if "=" not in word]:
+        refuse(f"{wrong[0]}: must be KEY=VALUE, as state=running")
+    with speaking(url, token) as client:
+        found = []
+        for job in client.jobs(**{"limit": min(limit, 200), **filters}):
+            found.append(job)
+            if len(found) == limit:
+                break
+        if as_json:
+            typer.echo(json.dumps([job.data for job in found], indent=2))
+        else:
+            show_table([row(job) for job in found])
+
+
+def show(identifier: JobId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """Show all about one job."""
+    with speaking(url, token) as client:
+        data = client.job(identifier).data
+    if as_json:
+        typer.echo(json.dumps(data, indent=2))
+        return
+    for key, value in data.items():
+        if value not in (None, [], {}) and key != "links":
+            text = value if isinstance(value, str) else json.dumps(value)
+            typer.echo(f"{key.replace('_', ' '):18}{visible(text)}")
+
+
+def log(
+    identifier: JobId,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Stay to the end of the job.")] = False,
+    url: Url = HERE,
+    token: Secret = None,
+) -> None:
+    """Print the log of one job."""
+    with speaking(url, token) as client:
+        job, offset = client.job(identifier), 0
+        while True:
+            final = job.final  # as it was before the last look
+            added = job.log_bytes(offset)
+            offset += len(added)
+            typer.echo(visible(added.decode(errors="replace"), keep="\n\t"), nl=False)
+            if final or not follow:
+                return
+            time.sleep(0.5)
+            job.refresh()
+
+
+def cancel(identifier: JobId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """End a job; what it has computed stays, in a checkpoint."""
+    alter(identifier, url, token, as_json, lambda job: job.cancel())
+
+
+def retry(identifier: JobId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """Queue a job that did not succeed again; it goes on from its checkpoint."""
+    alter(identifier, url, token, as_json, lambda job: job.retry())
+
+
+def rerun(identifier: JobId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
+    """Queue the case of a job once more, as a new job, from the start."""
+    alter(identifier, url, token, as_json, lambda job: job.rerun())
+
+
+def change(
+    identifier: JobId,
+    name: Annotated[str | None, typer.Option(help="Another name.")] = None,
+    priority: Annotated[int | None, typer.Option(help="Higher comes first.")] = None,
+    tag: Annotated[list[str] | None, typer.Option(help="All its tags from now on; may be given several times.")] = None,
+    url: Url = HERE,
+    token: Secret = None,
+    as_json: AsJson = False,
+) -> None:
+    """Give a job another name, priority or other tags."""
+    alter(identifier, url, token, as_json, lambda job: job.change(name=name, priority=priority, tags=tag or None))
+
+
+def remove(
+    identifiers: Annotated[list[str], typer.Argument(metavar="ID...", help="Of jobs and sweeps.")],
+    url: Url = HERE,
+    token: Secret = None,
+    as_json: AsJson = False,
+) -> None:
+    """Delete jobs, and sweeps with their jobs, that have ended: for good, with all their files."""
+    with speaking(url, token) as client:
+        rows = [removed(client, identifier) for identifier in identifiers]
+    tell_rows(rows, as_json)
+    if not all(each["removed"] for each in rows):
+        raise typer.Exit(2)
+
+
+def removed(client: "Client", identifier: str) -> dict[str, Any]:
+    """Of one job or sweep: whether it is gone, and why not."""
+    thing = "sweeps" if SWEEP.fullmatch(identifier) else "jobs"
+    try:
+        client.delete(f"/v1/{thing}/{identifier}")
+    except client.Problem as error:
+        if error.status not in (404, 409):
+            raise
+        return {"id": identifier, "removed": False, "reason": str(error.problem.get("detail"))}
+    return {"id": identifier, "removed": True, "reason": None}
+
+
+class Keep(NamedTuple):
+    """What is not to be removed."""
+
+    seconds: float | None
+    """jobs that ended no longer ago"""
+    states: frozenset[str]
+    """jobs in these states"""
+    bytes: float | None
+    """of all others the newest, as far as they fit into that together"""
+
+
+def keep_of(words: list[str]) -> Keep:
+    """From the command line: 30d, succeeded, 10GB; each kind may come, states several times."""
+    seconds, size, states = None, None, set()
+    for word in words:
+        found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([a-zA-Z]+)", word)
+        if word in ENDED:
+            states.add(word)
+        elif found is not None and found[2] in SECONDS:
+            seconds = float(found[1]) * SECONDS[found[2]]
+        elif found is not None and found[2] in BYTES:
+            size = float(found[1]) * BYTES[found[2]]
+        else:
+            allowed = f"an age as 30d ({', '.join(SECONDS)}), a size as 10GB ({', '.join(BYTES)})"
+            refuse(f"--keep {word}: must be {allowed}, or a state: {', '.join(ENDED)}")
+    return Keep(seconds, frozenset(states), size)
+
+
+def doomed(found: "Iterator[RemoteJob]", keep: Keep, now: float) -> "Iterator[RemoteJob]":
+    """Of jobs that have ended, the newest first, those that are not kept."""
+    total = 0.0
+    for job in found:
+        ended = job.ended
+        if not job.final or job.state in keep.states or ended is None:
+            continue
+        if keep.seconds is not None and now - ended <= keep.seconds:
+            continue
+        total += job.data["bytes"] or 0
+        if keep.bytes is None or total > keep.bytes:
+            yield job
+
+
+def gc(
+    keep: Annotated[
+        list[str], typer.Option("--keep", metavar="WHAT", help="30d, succeeded, 10GB: each keeps more; see below.")
+    ],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would go.")] = False,
+    url: Url = HERE,
+    token: Secret = None,
+    as_json: AsJson = False,
+) -> None:
+    """Delete jobs that have ended, but for those that --keep names.
+
+    An age keeps jobs that ended no longer ago; a state keeps the jobs in it; a size keeps, of all others, the newest
+    that fit into it. Jobs of others, and those that a sweep of somebody else refers to, stay.
+    """
+    wanted = keep_of(keep)
+    with speaking(url, token) as client:
+        found = client.jobs(state=",".join(ENDED), order="-ended", limit=500)
+        chosen = [*doomed(found, wanted, time.time())]
+        rows = []
+        for job in chosen:
+            outcome = {"id": job.id, "removed": False, "reason": None} if dry_run else collected(client, job)
+            rows.append({**outcome, "state": job.state, "name": job.name, "bytes": job.data["bytes"]})
+    gone = [each for each in rows if each["removed"]]
+    tell_rows(rows, as_json)
+    if not as_json:
+        freed = sum(each["bytes"] or 0 for each in (rows if dry_run else gone))
+        typer.echo(f"{len(rows) if dry_run else len(gone)} jobs, {freed} bytes{': would go' if dry_run else ''}")
+
+
+def collected(client: "Client", job: "RemoteJob") -> dict[str, Any]:
+    """As `removed`; another's job stays without a complaint."""
+    try:
+        return removed(client, job.id)
+    except client.Problem as error:
+        if error.status != 403:
+            raise
+        return {"id": job.id, "removed": False, "reason": str(error.problem.get("detail"))}
+
+
+def alter(
+    identifier: str, url: str, token: str | None, as_json: bool, move: "Callable[[RemoteJob], RemoteJob]"
+) -> None:
+    """Have something done to a job, and tell its state."""
+    with speaking(url, token) as client:
+        job = move(client.job(identifier))
+        word = "stopping" if job.data.get("stopping") else job.state
+        tell(job.data, as_json, f"{job.id} {word}")

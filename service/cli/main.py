@@ -1,0 +1,300 @@
+"""The command `frit`: words in; a launch, a picture or a schema out.
+
+Exit status: 0 done, 1 the run failed, 2 the input was refused, 130 interrupted with a checkpoint written.
+What a command imports beyond the terminal is imported inside it: `frit --help` is quick.
+"""
+
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from time import monotonic
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from ..jobs.launch import Launch, LaunchError, Outcome, read_record
+from . import compare, index, jobs, serve, service, sweep, token
+from .terminal import AsJson, cell, in_words, refuse
+
+EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
+GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
+
+app = typer.Typer(
+    name="frit",
+    help="Meshfree phase-field sintering of metal particles.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.add_typer(index.db, name="db")
+app.command()(index.reindex)
+app.add_typer(sweep.app, name="sweep")
+app.add_typer(token.app, name="token")
+app.add_typer(service.files, name="files")
+
+
+def at_least_one(ranks: int | None) -> int | None:
+    """Option callback."""
+    if ranks is not None and ranks < 1:
+        raise typer.BadParameter(f"{ranks}: must be 1 or more")
+    return ranks
+
+
+CaseFile = Annotated[Path, typer.Argument(metavar="CASE.toml", exists=True, dir_okay=False, help="Or JSON.")]
+Ranks = Annotated[int, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks.")]
+RunDirectory = Annotated[Path, typer.Argument(metavar="DIR", exists=True, file_okay=False)]
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+def show_version(wanted: bool) -> None:
+    """Option callback."""
+    if wanted:
+        try:
+            typer.echo(f"frit {version('frit')}")
+        except PackageNotFoundError:
+            typer.echo("frit, not installed")
+        raise typer.Exit
+
+
+@app.callback()
+def frit(
+    _version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True)] = False,
+) -> None:
+    """Options before the command."""
+
+
+@app.command()
+def run(
+    case: CaseFile,
+    ranks: Ranks = 1,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", file_okay=False, help="Run directory; default: runs/CASE.")
+    ] = None,
+    profile: Annotated[bool, typer.Option("--profile", help="Print where the time of each rank went.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run one case here; Ctrl-C writes a checkpoint and ends."""
+    check_case(case)
+    directory = out or Path("runs") / case.stem
+    state = read_record(directory).get("state")
+    if (directory / "run.json").exists() and state != "refused":
+        resumable = any((directory / name).exists() for name in ("checkpoint.h5", "case.json"))
+        way = f"`frit resume {directory}` goes on with it" if resumable else "it has no checkpoint: remove it"
+        refuse(f"--out {directory}: holds a run already (state: {state})", f"{way}, or name another folder")
+    follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json, profile)
+
+
+@app.command()
+def resume(
+    directory: RunDirectory,
+    ranks: Annotated[
+        int | None, typer.Option(metavar="N", callback=at_least_one, help="MPI ranks; default: as before.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Go on from the last checkpoint; anew where there was none yet."""
+    record = read_record(directory)
+    if record.get("state") == "done":
+        typer.echo(f"{directory} is done already", err=True)
+        report(directory, Outcome("done", record.get("message"), 0, ""), {}, None, as_json)
+        return
+    if not (directory / "checkpoint.h5").exists():
+        if not (directory / "case.json").exists():
+            refuse(f"{directory} has neither checkpoint.h5 nor case.json to go on from: run its case with `frit run`")
+        typer.echo(f"{directory} has no checkpoint yet: it is begun anew from its case.json", err=True)
+    ranks = ranks or int(record.get("ranks", 1))
+    follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
+
+
+@app.command()
+def plot(
+    directory: RunDirectory,
+    time: Annotated[
+        float | None, typer.Option(metavar="T", help="Model time; the nearest snapshot is shown.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: in DIR; .pdf, .svg too.")
+    ] = None,
+) -> None:
+    """Picture of the snapshot nearest to --time; of the history without it."""
+    from frit.sweeps import plots
+
+    try:
+        if time is None:
+            out = out or directory / "history.png"
+            plots.plot_history(directory, out)
+            typer.echo(f"{out}: history")
+        else:
+            time = plots.nearest_time(directory, time)
+            out = out or directory / f"snapshot-{time:g}.png"
+            plots.plot_snapshot(directory, time, out)
+            typer.echo(f"{out}: snapshot at t = {time:g}")
+    except (ValueError, OSError) as error:
+        refuse(str(error))
+
+
+for command in (serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
+                jobs.change, jobs.gc, compare.compare, service.plan, service.limits, service.events):  # fmt: skip
+    app.command()(command)
+app.command("rm")(jobs.remove)
+
+
+@app.command("pack")
+def pack_only(
+    case: CaseFile,
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", dir_okay=False, help="Particles: x,y[,z],radius, nm.")],
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: beside the CSV; .pdf, .svg too.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the packing only: a CSV, a picture, and what it is like."""
+    from . import pack
+
+    check_case(case)
+    try:
+        report = pack.pack(case, out, dict(os.environ))
+        picture = picture or out.with_suffix(".png")
+        pack.draw(out, report, f"{case.stem}: {report['packing']['count']} particles", picture)
+    except (ValueError, OSError) as error:
+        refuse(str(error))
+    if as_json:
+        typer.echo(json.dumps(report, indent=2))
+        return
+    console = Console(highlight=False)
+    for table in pack.tables(report):
+        console.print(table, "")
+    typer.echo(f"{out}, {picture}")
+
+
+@app.command()
+def schema() -> None:
+    """JSON Schema of the case file."""
+    from frit.solver.case import case_schema
+
+    typer.echo(json.dumps(case_schema(), indent=2))
+
+
+def check_case(path: Path) -> None:
+    """Refuse a wrong case with a line per problem."""
+    from frit.solver.case import CaseError, load_case
+
+    try:
+        load_case(path)
+    except CaseError as error:
+        refuse(*(f"{path}: {line}" for line in str(error).splitlines()))
+
+
+# --- following a launch ---------------------------------------------------------------------------------
+
+
+def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, profile: bool = False) -> NoReturn:
+    """Launch the solver, show its progress to the end, and leave with the exit status of its outcome."""
+    try:
+        launch = Launch(ranks, arguments, directory)
+    except (LaunchError, OSError) as error:
+        refuse(str(error))
+    start, progress = monotonic(), dict[str, Any]()
+    with launch, progress_bar() as (bar, task), signals_passed_on(launch, bar, task):
+        for progress in launch:
+            bar.update(task, completed=progress.get("time"), total=progress.get("end"))
+            if not launch.stopping:
+                bar.update(task, description=in_words(progress))
+        outcome = launch.wait()
+    report(directory, outcome, progress, monotonic() - start, as_json)
+    if profile and (seconds := read_record(directory).get("profile")):
+        from frit.solver.profile import table
+
+        typer.echo("\n" + table(seconds), err=as_json)
+    raise typer.Exit(EXIT[outcome.state])
+
+
+@contextmanager
+def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[None]:
+    """INT, TERM, HUP: one TERM to the ranks; a second INT kills. What nohup or & had ignored stays so."""
+
+    def handle(number: int, _: object) -> None:
+        if launch.stopping and number == signal.SIGINT:
+            launch.kill()
+        launch.stop(GRACE)
+        bar.update(task, description="writing a checkpoint; Ctrl-C again kills")
+
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
+    for number in heard:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number in heard:
+            signal.signal(number, before[number])
+
+
+@contextmanager
+def progress_bar() -> Iterator[tuple[Progress, TaskID]]:
+    """On stderr, and only where somebody sees it."""
+    seen = sys.stdout.isatty() and sys.stderr.isatty()
+    text = TextColumn("{task.description}", markup=False)
+    with Progress(BarColumn(bar_width=12), text, console=Console(stderr=True), disable=not seen) as bar:
+        yield bar, bar.add_task("starting", total=None)
+
+
+def report(
+    directory: Path, outcome: Outcome, progress: dict[str, Any], wall_time: float | None, as_json: bool
+) -> None:
+    """The summary on stdout; what went wrong and how to go on, on stderr."""
+    summary = summarise(directory, outcome, progress, wall_time)
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+    else:
+        for key, value in summary.items():
+            values = value if isinstance(value, list) else [value]
+            typer.echo(f"{key.replace('_', ' '):15}{' -> '.join(map(cell, values))}")
+    for note in read_record(directory).get("notes", []):
+        typer.echo(f"note: {note}", err=True)
+    if outcome.state in ("failed", "refused"):
+        log = directory / "log.txt"
+        lines = [outcome.errors, outcome.message, f"see {log}" if log.exists() else None]
+        typer.echo("\n".join(filter(None, lines)), err=True)
+    elif outcome.state == "interrupted":
+        typer.echo(f"interrupted ({outcome.message}); `frit resume {directory}` goes on", err=True)
+
+
+def summarise(
+    directory: Path, outcome: Outcome, progress: dict[str, Any], wall_time: float | None
+) -> dict[str, Any]:
+    """The run so far, from its last history row or the last progress line; `wall_time` is this launch's."""
+    from frit.sweeps.plots import read_history
+
+    history = read_history(directory)
+    last = {key: column[-1].item() for key, column in history.items()}
+    if progress.get("time", -math.inf) >= last.get("time", -math.inf):
+        last |= progress
+    first = [column[0].item() for key, column in history.items() if key == "vacancy_ratio"]
+    return {
+        "state": outcome.state,
+        "message": outcome.message,
+        "time": finite(last.get("time")),
+        "steps": last.get("step"),
+        "evaluations": last.get("evaluations"),
+        "wall_time": round(last.get("wall_time", 0.0) if wall_time is None else wall_time, 2),
+        "vacancy_ratio": [finite(v) for v in (*first, last.get("vacancy_ratio"))],
+        "directory": str(directory),
+    }
+
+
+def finite(value: float | None) -> float | None:
+    """JSON knows no NaN."""
+    return value if value is not None and math.isfinite(value) else None

@@ -1,0 +1,237 @@
+"""Jobs and sweeps of a service, as a script holds them."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from .client import Client, Event
+
+Tree = dict[str, Any]
+LONGEST_PAUSE = 2.0  # seconds between two looks at a job
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A complete snapshot: its place along the arrays' first axis, and its model time."""
+
+    number: int
+    time: float
+
+
+class RemoteJob:
+    """A job as the service last told it; `refresh` asks again."""
+
+    def __init__(self, client: "Client", data: Tree) -> None:
+        self.client, self.data = client, data
+
+    def __repr__(self) -> str:
+        return f"<job {self.id} {self.name!r}: {self.state}>"
+
+    @property
+    def id(self) -> str:
+        """Of the job."""
+        return str(self.data["id"])
+
+    @property
+    def name(self) -> str:
+        """Of the job."""
+        return str(self.data["name"])
+
+    @property
+    def state(self) -> str:
+        """queued, starting, running, succeeded, failed, error, cancelled, timed_out or lost."""
+        return str(self.data["state"])
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing more happens by itself."""
+        return bool(self.data["final"])
+
+    @property
+    def ended(self) -> float | None:
+        """When, in seconds since 1970."""
+        return None if self.data["ended"] is None else datetime.fromisoformat(self.data["ended"]).timestamp()
+
+    @property
+    def message(self) -> str | None:
+        """What was said at its end."""
+        message: str | None = self.data["message"]
+        return message
+
+    @property
+    def parameters(self) -> Tree:
+        """Every scalar of the case by dotted key."""
+        parameters: Tree = self.data["parameters"]
+        return parameters
+
+    @property
+    def result(self) -> Tree:
+        """Scalars of the last history row."""
+        result: Tree = self.data["result"]
+        return result
+
+    @property
+    def zarr_url(self) -> str:
+        """What zarr and xarray open: `xarray.open_zarr(job.zarr_url)`."""
+        return f"{self.client.url}/v1/jobs/{self.id}/snapshots.zarr"
+
+    def refresh(self) -> Self:
+        """Ask again."""
+        self.data = self.client.get(f"/v1/jobs/{self.id}")
+        return self
+
+    def wait(self, timeout: float | None = None) -> Self:
+        """Until it is final, whatever it then is: see `state`. Raises `TimeoutError` after that many seconds."""
+        for _ in looks(timeout, f"job {self.id}"):
+            if self.refresh().final:
+                break
+        return self
+
+    def history(self) -> "pd.DataFrame":
+        """The history rows so far, a column per key."""
+        import pandas as pd
+
+        return pd.DataFrame(self.client.request("GET", f"/v1/jobs/{self.id}/history").json())
+
+    def stream(self) -> "Iterator[Event]":
+        """What has happened and happens, up to its end."""
+        return self.client.events(f"/v1/jobs/{self.id}/events")
+
+    def log(self, offset: int = 0) -> str:
+        """The solver's log from that byte on."""
+        return self.log_bytes(offset).decode(errors="replace")
+
+    def log_bytes(self, offset: int = 0) -> bytes:
+        """The same, to be counted: the next offset is the old one and its length."""
+        headers = {"Range": f"bytes={offset}-"} if offset else {}
+        try:
+            response = self.client.request("GET", f"/v1/jobs/{self.id}/log", headers=headers)
+        except self.client.Problem as error:
+            if error.status == 416:  # nothing new
+                return b""
+            raise
+        return response.content if response.status_code == 206 or not offset else response.content[offset:]
+
+    def snapshots(self) -> list[Snapshot]:
+        """The complete snapshots; their fields are at `zarr_url`."""
+        found = self.client.get(f"/v1/jobs/{self.id}/snapshots")["snapshots"]
+        return [Snapshot(row["number"], row["time"]) for row in found]
+
+    def cancel(self) -> Self:
+        """Ask for its end."""
+        self.data = self.client.post(f"/v1/jobs/{self.id}/cancel")
+        return self
+
+    def retry(self) -> Self:
+        """Queue it again; it goes on from its checkpoint."""
+        self.data = self.client.post(f"/v1/jobs/{self.id}/retry")
+        return self
+
+    def rerun(self) -> "RemoteJob":
+        """Queue its case as a new job, from the start."""
+        return RemoteJob(self.client, self.client.post(f"/v1/jobs/{self.id}/rerun"))
+
+    def change(
+        self, *, name: str | None = None, priority: int | None = None, tags: Sequence[str] | None = None
+    ) -> Self:
+        """Give it another name, priority or other tags."""
+        changes = {"name": name, "priority": priority, "tags": None if tags is None else list(tags)}
+        given = {key: value for key, value in changes.items() if value is not None}
+        self.data = self.client.request("PATCH", f"/v1/jobs/{self.id}", json=given).json()
+        return self
+
+    def delete(self) -> None:
+        """Delete it, with all its files, for good."""
+        self.client.delete(f"/v1/jobs/{self.id}")
+
+
+class RemoteSweep:
+    """A sweep as the service last told it; `refresh` asks again."""
+
+    def __init__(self, client: "Client", data: Tree) -> None:
+        self.client, self.data = client, data
+
+    def __repr__(self) -> str:
+        return f"<sweep {self.id} {self.name!r}: {self.states}>"
+
+    @property
+    def id(self) -> str:
+        """Of the sweep."""
+        return str(self.data["id"])
+
+    @property
+    def name(self) -> str:
+        """Of the sweep."""
+        return str(self.data["name"])
+
+    @property
+    def states(self) -> dict[str, int]:
+        """How many of its jobs are in which state."""
+        states: dict[str, int] = self.data["states"]
+        return states
+
+    def refresh(self) -> Self:
+        """Ask again."""
+        self.data = self.client.get(f"/v1/sweeps/{self.id}")
+        return self
+
+    def jobs(self, **filters: Any) -> Iterator[RemoteJob]:
+        """Its jobs, in the order of their submission."""
+        return self.client.jobs(sweep=self.id, **{"order": "created", **filters})
+
+    def wait(self, timeout: float | None = None) -> Self:
+        """Until every job is final. Raises `TimeoutError` after that many seconds."""
+        for _ in looks(timeout, f"sweep {self.id}"):
+            if not self._unfinished():
+                break
+        return self.refresh()
+
+    def _unfinished(self) -> bool:
+        going = {"queued", "starting", "running"} & self.refresh().states.keys()
+        return bool(going) or any(not job.final for job in self.jobs(state="error,lost"))
+
+    def history(self) -> "pd.DataFrame":
+        """The history rows of all its jobs, with a column `job`."""
+        import pandas as pd
+
+        tables = [job.history().assign(job=job.id) for job in self.jobs()]
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+    def compare(self, observable: str = "vacancy_ratio", rows: int = 200) -> Tree:
+        """An observable of all its jobs over time, in at most so many rows, with the parameters that differ."""
+        found = self.client.get(f"/v1/sweeps/{self.id}/compare", params={"observable": observable, "rows": rows})
+        while (following := found["next"]) is not None:
+            page = self.client.get(following)
+            found = {**page, "curves": found["curves"] + page["curves"]}
+        return found
+
+    def cancel(self) -> Self:
+        """Ask for the end of all its jobs that have not ended."""
+        self.data = self.client.post(f"/v1/sweeps/{self.id}/cancel")
+        return self
+
+    def retry(self) -> Self:
+        """Queue all its jobs that ended without success again."""
+        self.data = self.client.post(f"/v1/sweeps/{self.id}/retry")
+        return self
+
+    def delete(self) -> None:
+        """Delete it and the jobs that were made with it and that no other sweep refers to."""
+        self.client.delete(f"/v1/sweeps/{self.id}")
+
+
+def looks(timeout: float | None, what: str) -> Iterator[None]:
+    """Again and again, with growing pauses. Raises `TimeoutError`."""
+    start, pause = time.monotonic(), 0.05
+    while True:
+        yield
+        left = pause if timeout is None else start + timeout - time.monotonic()
+        if left <= 0:
+            raise TimeoutError(f"{what}: not done after {timeout} s")
+        time.sleep(min(pause, left))
+        pause = min(1.5 * pause, LONGEST_PAUSE)

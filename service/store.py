@@ -1103,7 +1103,7 @@ def _existing_ids(t: Transaction, which: Sequence[str]) -> dict[str, int]:
 
 
 def _existing(connection: Connection, which: Sequence[str], recompute: bool = False) -> dict[str, int]:
-    """The seq of a job of each identity that has one of use: one that is done, else on its way; of equals the newest."""
+    """The seq of a job of each identity that has one of use: one that is done, or on its way; of equals the newest."""
     best: dict[str, tuple[int, int]] = {}
     for k in range(0, len(which), 500):
         for row in connection.execute(sa.select(*USEFUL).where(jobs.c.identity.in_(which[k : k + 500]))):

@@ -136,7 +136,7 @@ def nodes_in_range(case: Case, spacing: float) -> float:
     if shape["kind"] == "linear":
         return dim + 1.0
     if factored(case):
-        return FACTORED[dim] * (1 + int(_reach(shape) - 0.25)) / 3  # the default functions have twice that along an axis
+        return FACTORED[dim] * (1 + int(_reach(shape) - 0.25)) / 3  # 3: of the default functions
     reach = _reach(shape) * (shape.get("width") or spacing) / spacing
     return pi * reach**2 * 2 / sqrt(3) if dim == 2 else 4 / 3 * pi * reach**3 * 0.75 * sqrt(3)
 

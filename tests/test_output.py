@@ -170,7 +170,7 @@ def test_snapshots_hold_the_fields_at_the_times_asked_for(pair: Path) -> None:
     # At t = 0 a node with rho >= 1/2 belongs to the disc that it lies in.
     solid = found["rho"][0] >= 0.5
     assert ((found["particle"][0] >= 0) == solid).all()
-    away = [np.linalg.norm(mesh.nodes - c, axis=1) - r for c, r in zip([[6.5, 6.2], [15.4, 6.8]], [5, 4], strict=True)]
+    away = [np.linalg.norm(nodes - c, axis=1) - r for c, r in zip([[6.5, 6.2], [15.4, 6.8]], [5, 4], strict=True)]
     assert (found["particle"][0][solid] == np.argmin(away, axis=0)[solid]).all()
     # sum eta^2 is 1 in a particle and 0 outside: the tails of the profile, exp(-2 d / xi), at 4 nm, which the functions
     # smooth: means over a variance s^2 = 1 / (2 gamma) nm^2 along each axis multiply exp(2 r) by

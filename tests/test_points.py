@@ -122,7 +122,8 @@ def test_what_is_too_narrow_or_too_wide_is_told_with_place_and_remedy(tmp_path: 
 )
 def test_what_makes_no_sense_is_refused(tables: dict[str, Any], key: str) -> None:
     particle = {"centres": [[6.0, 5.0]], "radii": [2.5]}
-    tree = {"domain": {"size": [12.0, 10.0]}, "nodes": {"source": "triangular", "spacing": 1.0}, "particles": particle, "time": {"end": 1.0}}
+    nodes = {"source": "triangular", "spacing": 1.0}
+    tree = {"domain": {"size": [12.0, 10.0]}, "nodes": nodes, "particles": particle, "time": {"end": 1.0}}
     with pytest.raises(CaseError) as refusal:
         parse_case(tree | tables)
     assert key in str(refusal.value)

@@ -8,8 +8,8 @@ import pytest
 from indexing import attempted, done, new, opened
 from test_case import tables
 
-from frit.service.jobs import Job, Move, State
-from frit.service.store import NewPoint, Store
+from frit.service.index.store import NewPoint, Store
+from frit.service.jobs.states import Job, Move, State
 from frit.solver import __main__ as main
 from frit.solver import revision
 from frit.solver.case import Case, Model, fingerprint, parse_case

@@ -129,8 +129,8 @@ OTHERS: list[tuple[int, dict[str, Any]]] = [
 def test_every_file_with_compiled_code_names_the_cache() -> None:
     """Else an edit to it would leave old code in the folder."""
     folder = Path(jit.__file__).parent
-    decorated = re.compile(r"^@(jit|inlined|exact|numba)", re.MULTILINE)
-    marked = {path.name for path in folder.glob("*.py") if decorated.search(path.read_text())}
+    decorated = re.compile(r"^@(jit|inlined|lean|exact|numba)", re.MULTILINE)
+    marked = {str(path.relative_to(folder)) for path in folder.rglob("*.py") if decorated.search(path.read_text())}
     assert len(marked) > 10
     assert marked <= set(jit.COMPILED)
     assert all((folder / name).exists() for name in jit.COMPILED)

@@ -12,7 +12,19 @@ from sqlalchemy.engine import Connection
 from ..jobs.states import Job, NewJob, State, older_revision
 from .changes import retried, set_columns
 from .keys import known, remember, reused
-from .records import MADE_BY, OLD_CASE, WHOLE, Key, KeyReusedError, NewPoint, SweepRecord, compact, find_job, find_sweep, record
+from .records import (
+    MADE_BY,
+    OLD_CASE,
+    WHOLE,
+    Key,
+    KeyReusedError,
+    NewPoint,
+    SweepRecord,
+    compact,
+    find_job,
+    find_sweep,
+    record,
+)
 from .schema import events, idempotency, jobs, sweep_jobs, sweeps
 from .writer import Share, Transaction, Writer
 
@@ -158,7 +170,7 @@ def times_before(t: Transaction, which: Sequence[str]) -> dict[str, int]:
 def existing(
     connection: Connection, which: Sequence[str], recompute: bool = False, *among: sa.ColumnElement[bool]
 ) -> dict[str, int]:
-    """The seq of a job of each identity that has one of use: one that is done, else on its way; of equals the newest."""
+    """The seq of a job of each identity that has one of use: one that is done, or on its way; of equals the newest."""
     best: dict[str, tuple[int, int]] = {}
     asked = jobs.c.seq, jobs.c.identity, jobs.c.state, jobs.c.retrying, MADE_BY, OLD_CASE
     for k in range(0, len(which), 500):

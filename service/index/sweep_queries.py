@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import sqlalchemy as sa
 
+from ..jobs.states import older_revision
 from .reading import Reading
 from .records import MADE_BY, OLD_CASE, Compared, SweepPoint, SweepRecord, find_sweep, record
-from ..jobs.states import older_revision
 from .schema import history, jobs, sweep_jobs, sweeps
 
 
@@ -62,7 +62,8 @@ class SweepQueries(Reading):
     def compared(self, sweep: int, after: int, limit: int) -> list[Compared]:
         """The jobs of a sweep (by seq), in its own order, from that point on."""
         query = (
-            sa.select(jobs.c.seq, jobs.c.id, sweep_jobs.c.name, jobs.c.state, sweep_jobs.c.parameters, MADE_BY, OLD_CASE)
+            sa.select(jobs.c.seq, jobs.c.id, sweep_jobs.c.name, jobs.c.state, sweep_jobs.c.parameters)
+            .add_columns(MADE_BY, OLD_CASE)
             .join_from(sweep_jobs, jobs).where(sweep_jobs.c.sweep == sweep).order_by(sweep_jobs.c.position)
             .offset(after).limit(limit)
         )  # fmt: skip

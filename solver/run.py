@@ -51,13 +51,13 @@ class Event:
 class Observer(Protocol):
     """What listens to a run. All ranks call every method at the same moment."""
 
-    def history(self, system: System, state: Progress, u: Floats, time: float) -> None:
+    def history(self, scheme: Any, state: Any, u: Floats, time: float) -> None:
         """A history time has been reached; u are the fields there."""
 
-    def snapshot(self, number: int, system: System, state: Progress, u: Floats, time: float) -> None:
+    def snapshot(self, number: int, scheme: Any, state: Any, u: Floats, time: float) -> None:
         """A snapshot time has been reached."""
 
-    def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
+    def after_step(self, scheme: Any, state: Any, integrator: Integrator) -> bool:
         """A step has ended well: time for checkpoints and progress. True ends the run here."""
 
 

@@ -8,7 +8,8 @@ import pytest
 from indexing import attempted, done, new, opened
 from test_case import tables
 
-from frit.service.index.store import NewPoint, Store
+from frit.service.index.records import NewPoint
+from frit.service.index.store import Store
 from frit.service.jobs.states import Job, Move, State
 from frit.solver import __main__ as main
 from frit.solver import revision

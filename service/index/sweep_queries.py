@@ -68,7 +68,11 @@ class SweepQueries(Reading):
             .offset(after).limit(limit)
         )  # fmt: skip
         with self.reading() as connection:
-            return [Compared(*row[:5], older_revision(*row[5:])) for row in connection.execute(query)]
+            rows = connection.execute(query).all()
+        return [
+            Compared(seq, identifier, name, state, parameters, older_revision(revision, case))
+            for seq, identifier, name, state, parameters, revision, case in rows
+        ]
 
     def differing(self, sweep: int) -> list[str]:
         """The parameters that are not the same in all points of a sweep (by seq), in the order of its axes."""

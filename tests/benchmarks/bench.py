@@ -27,6 +27,7 @@ from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, make_integrator, prepare
 from frit.solver.run import run
 from frit.solver.scheme import Scheme
+from frit.solver.setup import make_setup
 from frit.solver.shape import lme
 from frit.solver.simd import LANES
 from frit.solver.state import State
@@ -50,7 +51,7 @@ def two_discs(end: float = 10.0, **changes: dict[str, Any]) -> Case:
     """Two touching discs of radius 20 nm at spacing 1, without rigid motion."""
     tree: dict[str, Any] = {
         "domain": {"size": [100.0, 60.0]},
-        "nodes": {"source": "lattice", "spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"source": "list", "centres": [[30.0, 30.0], [70.0, 30.0]], "radii": [20.0, 20.0]},
         "model": {"rigid_motion": False},
         "time": {"end": end, "integrator": "rk2"},
@@ -186,7 +187,7 @@ def particles_one(count: int) -> None:
     ]
     tree = {
         "domain": {"size": [340.0, 300.0]},
-        "nodes": {"source": "lattice", "spacing": 1.0},
+        "nodes": {"source": "triangular", "spacing": 1.0},
         "particles": {"source": "list", "centres": centres, "radii": [radius] * count},
         "time": {"end": 0.03, "integrator": "adaptive"},  # the rim of 1000 discs in contact is crushed after 0.05
         "activation": {"enabled": False},
@@ -221,7 +222,7 @@ def bench_traffic() -> None:
         places = np.stack(np.meshgrid(*[np.arange(count)] * dim), axis=-1).reshape(-1, dim)
         case = parse_case({
             "domain": {"size": size},
-            "nodes": {"source": "lattice", "spacing": 1.0},
+            "nodes": {"source": "triangular", "spacing": 1.0},
             "particles": {"source": "list", "centres": (7.0 + 9.6 * places).tolist(), "radii": [5.0] * count**dim},
             "time": {"end": 1.0},
         })  # fmt: skip
@@ -254,7 +255,41 @@ def traffic(scheme: Scheme) -> int:
     return moved + 2 * (scheme.point.nbytes + scheme.active.mask.nbytes)
 
 
+def crowd(dim: int, source: str, spacing: float, moving: bool) -> Case:
+    """Particles in contact everywhere: 64 spheres of 9.7 nm, or 100 discs of 5.7 nm."""
+    count, apart, radius = (4, 19.7, 9.7) if dim == 3 else (10, 11.5, 5.7)
+    places = np.stack(np.meshgrid(*[np.arange(count)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    return parse_case({
+        "domain": {"size": [2 * radius + 1.6 + apart * (count - 1)] * dim},
+        "nodes": {"source": source, "spacing": spacing},
+        "particles": {"centres": (radius + 0.8 + apart * places).tolist(), "radii": [radius] * count**dim},
+        "model": {"rigid_motion": moving},
+        "time": {"end": 1.0},
+    })  # fmt: skip
+
+
+def bench_lattices() -> None:
+    """One evaluation on square and cubic lattices, and on triangular and body-centred ones of about as many nodes."""
+    print("one evaluation where particles touch everywhere: square or cubic lattice, triangular or body-centred one")
+    for dim, spacing, other in ((2, 0.5, 0.5373), (3, 1.1, 1.2117)):
+        for moving in (False, True):
+            runs = []
+            for source, h in (("lattice", spacing), ("triangular", other)):
+                setup = make_setup(crowd(dim, source, h, moving), Ranks())
+                scheme, state, _ = setup.start()
+                y = scheme.vector(state)
+                runs.append((setup.nodes, partial(_seconds, partial(scheme.rates, y, np.empty_like(y)))))
+                runs[-1][1]()
+            pairs = [[measure() for _, measure in runs] for _ in range(9)]  # by turns
+            ours, theirs = (statistics.median(pair[k] for pair in pairs) for k in range(2))
+            print(
+                f"  {dim}-D, {'with' if moving else 'no  '} motion  {runs[0][0]:7d} nodes {1e3 * ours:7.1f} ms"
+                f"  {runs[1][0]:7d} nodes {1e3 * theirs:7.1f} ms  ratio {theirs / ours:.1f}"
+            )
+
+
 BENCHES = {
+    "lattices": bench_lattices,
     "traffic": bench_traffic,
     "two-discs": bench_two_discs,
     "shape": bench_shape,

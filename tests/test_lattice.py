@@ -33,6 +33,9 @@ SPHERES: dict[str, Any] = DISCS | {
 }
 
 
+EPS = 0.02  # 1/nm: at some points fields vary by more, at others by less
+
+
 def started(tree: dict[str, Any]) -> tuple[LatticeScheme, LatticeState]:
     setup = LatticeSetup(parse_case(tree), Ranks())
     scheme, state, _ = setup.start()
@@ -149,14 +152,15 @@ def test_rates_are_those_of_the_plain_sums(tree: dict[str, Any], changes: dict[s
     for a in range(2):
         mine, theirs = whole(scheme, rate, 1 + a), expected.eta[:, a]
         inside = whole(scheme, np.ones_like(y), 1 + a).astype(bool) & (mine != 0.0)
-        np.testing.assert_allclose(mine[inside], theirs[inside], atol=1e-11 * scale)
+        # At the rim points count that have no corner of their cell in the window, and are left out: below eps.
+        np.testing.assert_allclose(mine[inside], theirs[inside], atol=1e-9 * scale, rtol=1e-11)
         assert np.abs(theirs[~inside]).max(initial=0.0) < 1e-5 * scale
 
 
 def energy(scheme: LatticeScheme, y: Floats) -> tuple[float, float, float, float]:
     g = scheme.lattice
     fields = y.reshape(1, -1), scheme.layout, g.tables, scheme.room
-    return loops.energy(*fields, g.coefficients, 1e-5, 1e-5, 0, 0, len(g.layers))
+    return loops.energy(*fields, g.coefficients, EPS, EPS, 0, 0, len(g.layers))
 
 
 def test_mass_is_conserved_and_energy_falls_without_motion() -> None:
@@ -182,9 +186,9 @@ def test_energy_is_that_of_the_plain_sum() -> None:
         rho = whole(scheme, state.y, 0)
         eta = np.stack([whole(scheme, state.y, 1), whole(scheme, state.y, 2)], axis=-1)
         assert pytest.approx(reference.free_energy(rho, eta, N, dN, w, g.coefficients), rel=1e-7) == F
-        steep = np.linalg.norm(np.einsum("pnd,n->pd", dN, rho), axis=1) >= 1e-5
+        steep = np.linalg.norm(np.einsum("pnd,n->pd", dN, rho), axis=1) >= EPS
         slopes = np.linalg.norm(np.einsum("pnd,nk->pkd", dN, eta), axis=2)
-        assert live == (steep | (slopes >= 1e-5).any(axis=1)).sum() < len(w)
+        assert live == (steep | (slopes >= EPS).any(axis=1)).sum() < len(w)
         assert (least, most) == pytest.approx((float((N @ rho).min()), float((N @ rho).max())), abs=1e-14)
 
 
@@ -232,7 +236,8 @@ def test_the_neck_of_two_discs_is_the_chord_of_the_solid() -> None:
 def test_windows_follow_the_fields_and_lose_nothing_that_counts() -> None:
     scheme, state = started(DISCS)
     sizes = scheme.boxes.size.copy()
-    assert sizes.prod(axis=1).max() < 0.7 * np.prod(scheme.lattice.nodes)  # they are windows
+    inside = (scheme.boxes.end - np.minimum(scheme.boxes.begin, scheme.boxes.end)).sum()
+    assert inside < 0.9 * 2 * np.prod(scheme.lattice.nodes)  # of two fields on all nodes
     y = state.y.copy()
     w = 1
     assert windows.rim(y, scheme.layout, np.array(scheme.lattice.nodes), 1) < 1e-5

@@ -46,8 +46,8 @@ class Room(NamedTuple):
 
     Z: Floats  # (4 rows, width) sums along the slow axis: N and dN of point 0, of point 1
     Q: Floats  # (4 rows, width) what goes back along the slow axis
-    Y: Floats  # (3, width) sums along the middle axis: value, derivatives along the middle and the slow axis
-    F: Floats  # (4, width) source and flux along fast, middle, slow axis of a row of points
+    Y: Floats  # (6, width) sums along the middle axis, p by p: value, derivatives along the middle and the slow axis
+    F: Floats  # (8, width) of a row of points, p by p: source and flux along fast, middle, slow axis
     spans: Integers  # (rows, 2) packs of each row that hold anything
     sums: Floats  # (8 cells, P) S1, sum_(b != a) eta_a eta_b, S2, S3 of points 0 and of points 1
     swept: Floats  # (6 cells, P) v_adv along fast, middle, slow axis
@@ -87,7 +87,7 @@ def along_slow(slopes: bool, Z: Floats, spans: Integers, y: Floats, w: int, k: i
         at = L.offset[w] + ((first + t0) * nm + r) * nf
         if t1 - t0 == SIX:
             for q in range(b, e):
-                sum_slow(slopes, Z, y, at, nm * nf, r, q, k, 0, SIX, T)
+                sum_slow(slopes, Z, y, at, nm * nf, r, q, k, t0, SIX, T)
         else:
             for q in range(b, e):
                 sum_slow(slopes, Z, y, at, nm * nf, r, q, k, t0, t1 - t0, T)
@@ -143,16 +143,16 @@ def along_middle(
             begin, end = min(begin, spans[r, 0]), max(end, spans[r, 1])
     if t1 - t0 == SIX:
         for q in range(begin, end):
-            sum_middle(slopes, Y, Z, first, q, j, p, 0, SIX, T)
+            sum_middle(slopes, Y, Z, first + t0, q, j, p, t0, SIX, T)
     else:
         for q in range(begin, end):
             sum_middle(slopes, Y, Z, first + t0, q, j, p, t0, t1 - t0, T)
     if end > begin:
         for q in (begin - 2, begin - 1, end, end + 1):
-            store(Y, 0, PAD + LANES * q, splat(0.0))
+            store(Y, 3 * p, PAD + LANES * q, splat(0.0))
             if slopes:
-                store(Y, 1, PAD + LANES * q, splat(0.0))
-                store(Y, 2, PAD + LANES * q, splat(0.0))
+                store(Y, 3 * p + 1, PAD + LANES * q, splat(0.0))
+                store(Y, 3 * p + 2, PAD + LANES * q, splat(0.0))
 
 
 @lean
@@ -170,10 +170,10 @@ def sum_middle(
         if slopes:
             d_middle = d_middle + T.d_middle[p, j, t0 + t] * u
             d_slow = d_slow + T.middle[p, j, t0 + t] * load(Z, (2 * p + 1) * rows + r + t, PAD + LANES * q)
-    store(Y, 0, PAD + LANES * q, value)
+    store(Y, 3 * p, PAD + LANES * q, value)
     if slopes:
-        store(Y, 1, PAD + LANES * q, d_middle)
-        store(Y, 2, PAD + LANES * q, d_slow)
+        store(Y, 3 * p + 1, PAD + LANES * q, d_middle)
+        store(Y, 3 * p + 2, PAD + LANES * q, d_slow)
 
 
 @lean
@@ -191,10 +191,10 @@ def value_at(Y: Floats, q: int, c: int, p: int, T: Tables) -> Pack:
     value = splat(0.0)
     if inner(c, T):
         for t in range(SIX):
-            value = value + T.inner[p, t] * load(Y, 0, at + t)
+            value = value + T.inner[p, t] * load(Y, 3 * p, at + t)
     else:
         for t in range(taps):
-            value = value + load(T.fast, p * taps + t, GHOSTS + c) * load(Y, 0, at + t)
+            value = value + load(T.fast, p * taps + t, GHOSTS + c) * load(Y, 3 * p, at + t)
     return value
 
 
@@ -209,19 +209,21 @@ def all_at(Y: Floats, q: int, c: int, p: int, T: Tables) -> tuple[Pack, Pack, Pa
     d_slow = splat(0.0)
     if inner(c, T):
         for t in range(SIX):
-            u = load(Y, 0, at + t)
+            u = load(Y, 3 * p, at + t)
             value = value + T.inner[p, t] * u
             d_fast = d_fast + T.d_inner[p, t] * u
-            d_middle = d_middle + T.inner[p, t] * load(Y, 1, at + t)
-            d_slow = d_slow + T.inner[p, t] * load(Y, 2, at + t)
+            d_slow = d_slow + T.inner[p, t] * load(Y, 3 * p + 2, at + t)
+        if T.middle.shape[2] > 1:
+            for t in range(SIX):
+                d_middle = d_middle + T.inner[p, t] * load(Y, 3 * p + 1, at + t)
     else:
         for t in range(taps):
             N = load(T.fast, p * taps + t, GHOSTS + c)
-            u = load(Y, 0, at + t)
+            u = load(Y, 3 * p, at + t)
             value = value + N * u
             d_fast = d_fast + load(T.d_fast, p * taps + t, GHOSTS + c) * u
-            d_middle = d_middle + N * load(Y, 1, at + t)
-            d_slow = d_slow + N * load(Y, 2, at + t)
+            d_middle = d_middle + N * load(Y, 3 * p + 1, at + t)
+            d_slow = d_slow + N * load(Y, 3 * p + 2, at + t)
     return value, d_fast, d_middle, d_slow
 
 
@@ -253,7 +255,7 @@ def back(
     t0, t1 = max(0, -first), min(taps, L.size[w, 1] - first)
     for q in (b - 2, b - 1, e, e + 1):
         for f in range(4):
-            store(F, f, PAD + LANES * q, splat(0.0))
+            store(F, 4 * p + f, PAD + LANES * q, splat(0.0))
     begin, end = e, b
     for r in range(first + t0, first + t1):
         if spans[r, 1] > spans[r, 0]:
@@ -261,7 +263,7 @@ def back(
     for q in range(max(begin, b - 1), min(end, e + 1)):
         source, middle, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, T)
         if t1 - t0 == SIX:
-            back_middle(Q, source, middle, slow, first, q, j, p, 0, SIX, T)
+            back_middle(Q, source, middle, slow, first + t0, q, j, p, t0, SIX, T)
         else:
             back_middle(Q, source, middle, slow, first + t0, q, j, p, t0, t1 - t0, T)
 
@@ -276,17 +278,19 @@ def back_fast(F: Floats, q: int, node: int, p: int, T: Tables) -> tuple[Pack, Pa
     slow = splat(0.0)
     if inner(node, T):
         for t in range(SIX):
-            source = source + T.inner[p, t] * load(F, 0, at - t)
-            source = source + T.d_inner[p, t] * load(F, 1, at - t)
-            middle = middle + T.inner[p, t] * load(F, 2, at - t)
-            slow = slow + T.inner[p, t] * load(F, 3, at - t)
+            source = source + T.inner[p, t] * load(F, 4 * p, at - t)
+            source = source + T.d_inner[p, t] * load(F, 4 * p + 1, at - t)
+            slow = slow + T.inner[p, t] * load(F, 4 * p + 3, at - t)
+        if T.middle.shape[2] > 1:
+            for t in range(SIX):
+                middle = middle + T.inner[p, t] * load(F, 4 * p + 2, at - t)
     else:
         for t in range(taps):
             N = load(T.fast_back, p * taps + t, GHOSTS + node)
-            source = source + N * load(F, 0, at - t)
-            source = source + load(T.d_fast_back, p * taps + t, GHOSTS + node) * load(F, 1, at - t)
-            middle = middle + N * load(F, 2, at - t)
-            slow = slow + N * load(F, 3, at - t)
+            source = source + N * load(F, 4 * p, at - t)
+            source = source + load(T.d_fast_back, p * taps + t, GHOSTS + node) * load(F, 4 * p + 1, at - t)
+            middle = middle + N * load(F, 4 * p + 2, at - t)
+            slow = slow + N * load(F, 4 * p + 3, at - t)
     return source, middle, slow
 
 
@@ -315,7 +319,7 @@ def back_slow(rate: Floats, Q: Floats, spans: Integers, w: int, k: int, L: Layou
         at = L.offset[w] + ((first + t0) * nm + r) * nf
         if t1 - t0 == SIX:
             for q in range(spans[r, 0], spans[r, 1]):
-                give_slow(rate, Q, at, nm * nf, r, q, k, 0, SIX, T)
+                give_slow(rate, Q, at, nm * nf, r, q, k, t0, SIX, T)
         else:
             for q in range(spans[r, 0], spans[r, 1]):
                 give_slow(rate, Q, at, nm * nf, r, q, k, t0, t1 - t0, T)
@@ -370,6 +374,7 @@ def potential(
             b, e = cells_of(0, k, j, L)
             for p in range(2):
                 along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+            for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
                 touching = False
                 for q in range(b, e):
@@ -383,14 +388,15 @@ def potential(
                     store(points.S2, kept, at, S2)
                     store(points.D, kept, at, mobility(rho, overlap, m))
                     place = PAD + LANES * q
-                    store(room.F, 0, place, w_p * df_drho(rho, S2, S3, m))
-                    store(room.F, 1, place, (w_p * m.kappa_rho) * d_fast)
-                    store(room.F, 2, place, (w_p * m.kappa_rho) * d_middle)
-                    store(room.F, 3, place, (w_p * m.kappa_rho) * d_slow)
+                    store(room.F, 4 * p, place, w_p * df_drho(rho, S2, S3, m))
+                    store(room.F, 4 * p + 1, place, (w_p * m.kappa_rho) * d_fast)
+                    store(room.F, 4 * p + 2, place, (w_p * m.kappa_rho) * d_middle)
+                    store(room.F, 4 * p + 3, place, (w_p * m.kappa_rho) * d_slow)
                     if rigid and total(positive(overlap - m.c)) > 0.0:
                         touching = True
                 if touching:
                     meet_row(found, where, points, y, kept, k, j, p, first_layer, L, T, room, m)
+            for p in range(2):
                 back(room.Q, room.F, room.spans, 0, j, p, b, e, L, T)
         back_slow(W, room.Q, room.spans, 0, k, L, T)
     restore_denormals(mode)
@@ -407,6 +413,7 @@ def add_sums(w: int, k: int, y: Floats, L: Layout, T: Tables, room: Room) -> Non
             continue
         for p in range(2):
             along_middle(False, room.Y, room.Z, room.spans, w, j, p, L, T)
+        for p in range(2):
             for q in range(b, e):
                 c = L.low[w, 2] + LANES * q
                 at = GHOSTS + c
@@ -545,6 +552,7 @@ def divergence(
             b, e = cells_of(0, k, j, L)
             for p in range(2):
                 along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+            for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
@@ -560,10 +568,11 @@ def divergence(
                         middle = middle + rho * load(room.swept, (2 + p) * count + j, at)
                         slow = slow + rho * load(room.swept, (4 + p) * count + j, at)
                     place = PAD + LANES * q
-                    store(room.F, 0, place, splat(0.0))
-                    store(room.F, 1, place, w_p * fast)
-                    store(room.F, 2, place, w_p * middle)
-                    store(room.F, 3, place, w_p * slow)
+                    store(room.F, 4 * p, place, splat(0.0))
+                    store(room.F, 4 * p + 1, place, w_p * fast)
+                    store(room.F, 4 * p + 2, place, w_p * middle)
+                    store(room.F, 4 * p + 3, place, w_p * slow)
+            for p in range(2):
                 back(room.Q, room.F, room.spans, 0, j, p, b, e, L, T)
         back_slow(rate, room.Q, room.spans, 0, k, L, T)
     restore_denormals(mode)
@@ -588,6 +597,7 @@ def change(
             continue
         for p in range(2):
             along_middle(True, room.Y, room.Z, room.spans, w, j, p, L, T)
+        for p in range(2):
             kept = (p * layers + k - first_layer) * count + j
             height, depth = (T.z[p, k], 0.0) if plane else (T.y[p, j], T.z[p, k])
             v_x = motion[a, 0] + motion[a, 4] * depth - motion[a, 5] * height
@@ -616,10 +626,11 @@ def change(
                         add_to(room.swept, (2 + p) * count + j, at, swept * v_y)
                         add_to(room.swept, (4 + p) * count + j, at, swept * v_z)
                 place = PAD + LANES * q
-                store(room.F, 0, place, (-m.L * w_p) * df_deta(eta, rho, S2, m))
-                store(room.F, 1, place, fast)
-                store(room.F, 2, place, middle)
-                store(room.F, 3, place, slow)
+                store(room.F, 4 * p, place, (-m.L * w_p) * df_deta(eta, rho, S2, m))
+                store(room.F, 4 * p + 1, place, fast)
+                store(room.F, 4 * p + 2, place, middle)
+                store(room.F, 4 * p + 3, place, slow)
+        for p in range(2):
             back(room.Q, room.F, room.spans, w, j, p, b, e, L, T)
     back_slow(rate, room.Q, room.spans, w, k, L, T)
 
@@ -697,6 +708,7 @@ def energy(
                 b, e = cells_of(w, k, j, L)
                 for p in range(2):
                     along_middle(True, room.Y, room.Z, room.spans, w, j, p, L, T)
+                for p in range(2):
                     for q in range(b, e):
                         c = L.low[w, 2] + LANES * q
                         eta, x, v, z = all_at(room.Y, q, c, p, T)
@@ -710,6 +722,7 @@ def energy(
             b, e = cells_of(0, k, j, L)
             for p in range(2):
                 along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+            for p in range(2):
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
                     at = GHOSTS + c

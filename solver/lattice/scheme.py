@@ -199,7 +199,7 @@ class LatticeScheme:
         cells = 1 if g.axes[1] is None else g.axes[1].cells
         P = LANES * -(-g.tables.fast.shape[1] // LANES)
         self.room = Room(
-            np.zeros((4 * rows, width)), np.zeros((4 * rows, width)), np.zeros((3, width)), np.zeros((4, width)),
+            np.zeros((4 * rows, width)), np.zeros((4 * rows, width)), np.zeros((6, width)), np.zeros((8, width)),
             np.zeros((rows, 2), dtype=np.int64), np.zeros((8 * cells, P)), np.zeros((6 * cells, P)), np.zeros((12, 1)),
             np.zeros((64, 4 * LANES)), np.zeros(64, dtype=np.int64),
         )  # fmt: skip

@@ -19,7 +19,7 @@ class Page(NamedTuple):
 
     after: int = 0
     limit: int = CURVES
-    rows: int = 200
+    rows: int = 50
 
 
 def compare(store: Store, sweep: SweepRecord, observable: str, page: Page | None = None) -> views.Comparison:

@@ -80,23 +80,25 @@ async def show_sweep(request: Request, engine: TheEngine, who: Reader, sweep: Th
     return delivery.tagged(request, view.model_dump_json().encode(), "application/json")
 
 
-@api.get("/sweeps/{id}/compare", tags=["sweeps"], responses=PROBLEMS(401, 403, 404, 422, 503))
+@api.get(
+    "/sweeps/{id}/compare", tags=["sweeps"], response_model=views.Comparison,
+    responses=PROBLEMS(401, 403, 404, 422, 503),
+)  # fmt: skip
 async def compare_jobs(
-    request: Request, response: Response, engine: TheEngine, who: Reader, sweep: TheSweep,
+    engine: TheEngine, who: Reader, sweep: TheSweep,
     observable: Annotated[str, Query(max_length=100, description="A scalar of the history rows.")] = "vacancy_ratio",
     limit: Annotated[int, Query(ge=1, le=CURVES, description="Jobs on the page.")] = CURVES,
     after: Annotated[int, Query(ge=0, le=10**9, description="Points of the sweep before the page; see `next`.")] = 0,
-    rows: Annotated[int, Query(ge=2, le=ROWS, description="Points of a curve, at most: spread over its rows.")] = 200,
-) -> views.Comparison:  # fmt: skip
+    rows: Annotated[int, Query(ge=2, le=ROWS, description="Points of a curve, at most: spread over its rows.")] = 50,
+) -> Response:  # fmt: skip
     """An observable of the jobs over time, with the parameters that differ; page by page, in the order of the sweep."""
     try:
         found = await asyncio.to_thread(compare, engine.store, sweep, observable, Page(after, limit, rows))
     except ObservableError as error:
         wrong = WrongField(parameter="observable", value=observable, detail=str(error))
         raise refused("refused-query", "The query is refused", [wrong]) from None
-    if found.next is not None:
-        response.headers["Link"] = f'<{found.next}>; rel="next"'
-    return found
+    link = {} if found.next is None else {"Link": f'<{found.next}>; rel="next"'}
+    return Response(found.model_dump_json(), media_type="application/json", headers=link)
 
 
 CHANGES = PROBLEMS(401, 403, 404, 409, 413, 415, 422, 503)

@@ -1,5 +1,6 @@
 """Questions about sweeps."""
 
+import json
 from collections.abc import Sequence
 
 import sqlalchemy as sa
@@ -91,14 +92,16 @@ class SweepQueries(Reading):
         """
         own = observable in history.c
         value = f'"{observable}"' if own else "json_extract(data, ?1)"
-        marks = ", ".join(str(int(seq)) for seq in which)
         query = (
-            f"WITH each AS (SELECT job, max(row) AS last FROM history WHERE job IN ({marks}) GROUP BY job) "
-            f"SELECT each.job, time, {value} FROM each JOIN history ON history.job = each.job "
-            "WHERE row % (last / ?2 + 1) = 0 OR row = last ORDER BY each.job, row"
-        )
+            "WITH RECURSIVE each AS MATERIALIZED ("
+            "SELECT value AS job, (SELECT max(row) FROM history WHERE job = value) AS last FROM json_each(?3)), "
+            "step(n) AS MATERIALIZED (SELECT 0 UNION ALL SELECT n + 1 FROM step WHERE n < ?2) "
+            f"SELECT each.job, time, {value} FROM each CROSS JOIN step CROSS JOIN history "
+            "ON history.job = each.job AND row = min(n * (last / ?2 + 1), last) "
+            "WHERE n = 0 OR (n - 1) * (last / ?2 + 1) < last"
+        )  # row by row of one job after the other: nothing is sorted, and no row between is read
         found: dict[int, tuple[list[float], list[float | None]]] = {}
-        for job, at, number in self._ask(query, (f"$.{observable}", most - 1)):
+        for job, at, number in self._ask(query, (f"$.{observable}", most - 1, json.dumps([*which]))):
             times, values = found.setdefault(job, ([], []))
             times.append(at)
             values.append(number)

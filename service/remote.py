@@ -202,7 +202,7 @@ class RemoteSweep:
         tables = [job.history().assign(job=job.id) for job in self.jobs()]
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
-    def compare(self, observable: str = "vacancy_ratio", rows: int = 50) -> Tree:
+    def compare(self, observable: str = "vacancy_ratio", rows: int = 10_000) -> Tree:
         """An observable of all its jobs over time, in at most so many rows, with the parameters that differ."""
         found = self.client.get(f"/v1/sweeps/{self.id}/compare", params={"observable": observable, "rows": rows})
         while (following := found["next"]) is not None:

@@ -47,6 +47,11 @@ PRESSED: Case = {
     "output": {"history_every": 0.05},
 }
 
+def on_mesh(case: Case) -> Case:
+    """The case on a triangular lattice, or a body-centred one: nodes and points of a mesh."""
+    return case | {"nodes": {"source": "triangular", "spacing": 1.0}}
+
+
 # The solver waits for a signal after the given steps; see `held_at` and `until_held`.
 HELD = """
 import sys, time
@@ -210,9 +215,10 @@ def columns(directory: Path) -> dict[str, Array]:
 
 
 def final_fields(directory: Path) -> dict[str, Array]:
-    """The nodal fields of checkpoint.h5."""
+    """The fields of checkpoint.h5, and where they belong: by slots, or by windows."""
+    names = {"u", "owner", "slot_of", "y", "window_low", "window_size", "window_begin", "window_end"}
     with h5py.File(directory / "checkpoint.h5") as file:
-        return {name: np.asarray(file[name]) for name in ("u", "owner", "slot_of")}
+        return {name: np.asarray(file[name]) for name in file if name in names}
 
 
 def snapshots(directory: Path) -> dict[str, Array]:

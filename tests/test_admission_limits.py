@@ -95,7 +95,7 @@ MANY = [[20.0 + 30.0 * (k % 30), 20.0 + 30.0 * (k // 30)] for k in range(900)]
         ({"output.snapshots": {"every": 1e-4}}, "output/snapshots/every", 1e-4, "snapshots, must be at most 10000"),
         ({"output.snapshots": [1e-5 * k for k in range(10_001)]}, "output/snapshots", None, "must be at most 10000"),
         ({"nodes.spacing": 0.06, "output.snapshots": {"every": 2e-3}}, "output/snapshots/every", 2e-3, "bytes on disk"),
-        ({"nodes.spacing": 0.025}, "nodes/spacing", 0.025, "bytes of memory, must be at most 1.2e+10 on 1 ranks"),
+        ({"nodes.spacing": 0.02}, "nodes/spacing", 0.02, "bytes of memory, must be at most 1.2e+10 on 1 ranks"),
         (LARGE | {"particles": {"centres": MANY, "radii": [10.0] * 900}}, "activation/few_order_parameters", False,
          "bytes of memory"),
         ({"particles": {"centres": [[1.0, 1.0]] * 50_001, "radii": [1.0]}}, "particles/centres", None, "50001 entries"),

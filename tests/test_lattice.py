@@ -234,7 +234,8 @@ def test_the_neck_of_two_discs_is_the_chord_of_the_solid() -> None:
 
 
 def test_windows_follow_the_fields_and_lose_nothing_that_counts() -> None:
-    scheme, state = started(DISCS)
+    particles = {"centres": [[22.5, 18.2], [31.4, 18.8]]}
+    scheme, state = started(merged(DISCS, domain={"size": [52.0, 38.0]}, particles=particles))
     sizes = scheme.boxes.size.copy()
     inside = (scheme.boxes.end - np.minimum(scheme.boxes.begin, scheme.boxes.end)).sum()
     assert inside < 0.9 * 2 * np.prod(scheme.lattice.nodes)  # of two fields on all nodes

@@ -191,7 +191,7 @@ def test_keys_of_their_own_count_only_where_they_say_something() -> None:
 @pytest.mark.parametrize(
     ("tables", "revision"),
     [
-        ({}, 4),
+        ({"nodes": {"source": "lattice", "spacing": 1.0}}, 4),
         ({"nodes": {"source": "triangular", "spacing": 1.0}}, 1),
         ({"nodes": {"source": "gmsh", "spacing": 1.0}}, 2),
         ({"nodes": {"source": "gmsh", "spacing": 1.0}, "shape_functions": {"kind": "linear"}}, 1),

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from launching import PAIR, Case, Tree, columns, different, launch, record, snapshots, solve, write_case
+from launching import PAIR, Case, Tree, columns, different, launch, on_mesh, record, snapshots, solve, write_case
 
 from frit.sweeps.plots import plot_snapshot
 
@@ -26,14 +26,14 @@ TRIPLE: dict[int, Case] = {
 BROKEN = """
 import os, sys
 from frit.solver import __main__ as solver
-from frit.solver.scheme import Scheme
+from frit.solver.{module} as Scheme
 
 rates, calls = Scheme.rates, 0
 
 def broken(self, u, rate, tau=None):
     global calls
     calls += 1
-    if calls == 40 and self.d.share.ranks.rank == {rank}:  # step 20: two evaluations each
+    if calls == 40 and self.ranks.rank == {rank}:  # step 20: two evaluations each
         raise ValueError("the sum came out wrong")
     rates(self, u, rate, tau)
 
@@ -42,10 +42,10 @@ sys.exit(solver.main())
 """
 
 
-@pytest.fixture(scope="module", params=[2, 3], ids=["2-D", "3-D"])
+@pytest.fixture(scope="module", params=[2, 3, -2, -3], ids=["square", "cubic", "triangular", "body-centred"])
 def serial(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Case, Path]:
     """A case and its run on one rank."""
-    case = TRIPLE[request.param]
+    case = TRIPLE[abs(request.param)] if request.param > 0 else on_mesh(TRIPLE[abs(request.param)])
     return case, solve(case, tmp_path_factory.mktemp("ranks") / "1")
 
 
@@ -68,9 +68,10 @@ def test_the_case_is_worth_comparing(serial: tuple[Case, Path]) -> None:
     assert column["solid_mass"] == pytest.approx(column["solid_mass"][0], rel=1e-12)
 
 
-def test_two_ranks_take_the_adaptive_steps_of_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mesh", [False, True])
+def test_two_ranks_take_the_adaptive_steps_of_one(tmp_path: Path, mesh: bool) -> None:
     """Rounding enters the steps through their error and the spectral radius, a difference quotient over 1e-7."""
-    case = TRIPLE[2] | {
+    case = (on_mesh(TRIPLE[2]) if mesh else TRIPLE[2]) | {
         "time": {"integrator": "adaptive", "end": 0.3},
         "output": {"history_every": 0.01, "snapshots": [0.0, 0.17, 0.3]},
     }
@@ -100,10 +101,12 @@ sys.exit(solver.main())
 """
 
 
-def test_values_under_way_move_while_ranks_work(serial: tuple[Case, Path]) -> None:
+@pytest.mark.parametrize("dim", [2, 3])
+def test_values_under_way_move_while_ranks_work(tmp_path: Path, dim: int) -> None:
     """Looks after them are enough, none has to be waited for; and work in many pieces is the same work."""
-    case, alone = serial
-    together = solve(case, alone.with_name("polling"), ranks=2, script=POLLING)
+    case = on_mesh(TRIPLE[dim])
+    alone = solve(case, tmp_path / "alone")
+    together = solve(case, tmp_path / "polling", ranks=2, script=POLLING)
     assert different(alone, together, 1e-10) == {}
 
 
@@ -135,7 +138,7 @@ sys.exit(status)
 @pytest.mark.parametrize("integrator", ["rk2", "adaptive"])
 def test_a_run_divided_anew_is_the_same_run(tmp_path: Path, integrator: str) -> None:
     """It goes on in the same process from a checkpoint of this moment."""
-    case = TRIPLE[2]
+    case = on_mesh(TRIPLE[2])
     if integrator == "adaptive":
         case = case | {"time": {"integrator": "adaptive", "end": 0.5}, "output": {"history_every": 0.05}}
     alone = solve(case, tmp_path / "1", ranks=2, script=OFTEN + "sys.exit(solver.main())")
@@ -144,10 +147,12 @@ def test_a_run_divided_anew_is_the_same_run(tmp_path: Path, integrator: str) -> 
     assert record(divided)["resumed"] == []
 
 
-@pytest.mark.parametrize("rank", [0, 1])
-def test_an_exception_on_one_rank_ends_all(tmp_path: Path, rank: int) -> None:
+@pytest.mark.parametrize(("rank", "mesh"), [(0, False), (1, False), (0, True)])
+def test_an_exception_on_one_rank_ends_all(tmp_path: Path, rank: int, mesh: bool) -> None:
     """The others wait in an exchange that never comes: without an abort this hangs."""
-    with launch(PAIR, tmp_path / "run", ranks=2, script=BROKEN.replace("{rank}", str(rank))) as tree:
+    module = "scheme import Scheme" if mesh else "lattice.scheme import LatticeScheme"
+    script = BROKEN.replace("{rank}", str(rank)).replace("{module}", module)
+    with launch(on_mesh(PAIR) if mesh else PAIR, tmp_path / "run", ranks=2, script=script) as tree:
         status, _ = tree.ended()
         assert tree.gone()
     assert status != 0

@@ -19,6 +19,7 @@ from launching import (
     history,
     interrupted,
     launch,
+    on_mesh,
     record,
     resume,
     solve,
@@ -37,6 +38,8 @@ CASES: dict[str, Case] = {
     "rk2": PAIR,
     "adaptive": ADAPTIVE,
     # Nothing is switched off: rates and contacts' stiffness are carried over from step to step.
+    "rk2 on a mesh": on_mesh(PAIR),
+    "adaptive on a mesh": on_mesh(ADAPTIVE),
     "carried": ADAPTIVE | {"activation": {"enabled": False, "few_order_parameters": False}},
 }
 
@@ -46,7 +49,7 @@ import sys, time
 from pathlib import Path
 from frit.solver import __main__ as solver
 
-build_mesh, Requests = solver.build_mesh, solver.Requests
+make_setup, Requests = solver.make_setup, solver.Requests
 
 class Seen(Requests):
     def __init__(self):
@@ -57,9 +60,9 @@ def hold(case, ranks, rows):
     Path(sys.argv[sys.argv.index("--out") + 1], f"{ranks.rank}.start").touch()
     while not (Seen.one.checkpoint and Seen.one.end):
         time.sleep(0.005)
-    return build_mesh(case, ranks, rows)
+    return make_setup(case, ranks, rows)
 
-solver.Requests, solver.build_mesh = Seen, hold
+solver.Requests, solver.make_setup = Seen, hold
 sys.exit(solver.main())
 """
 
@@ -151,7 +154,7 @@ def test_signals_before_the_first_step_are_heard(tmp_path: Path, whole: dict[str
 
 def test_a_checkpoint_with_slots_to_spare_goes_on(tmp_path: Path, whole: dict[str, Path]) -> None:
     """Slots that were needed once are dealt out anew: the fields must follow their particles."""
-    directory = interrupted(PAIR, tmp_path / "run")
+    directory = interrupted(on_mesh(PAIR), tmp_path / "run")
     with h5py.File(directory / "checkpoint.h5", "r+") as file:
         for name in ("u", "reference"):
             u = np.zeros((len(file[name]), 16))
@@ -164,7 +167,7 @@ def test_a_checkpoint_with_slots_to_spare_goes_on(tmp_path: Path, whole: dict[st
             del file[name]
             file[name] = owner
         file["slot_of"][...] = file["reference_slot_of"][...] = [0, 8]
-    assert different(whole["rk2"], resume(directory), SAME) == {}
+    assert different(whole["rk2 on a mesh"], resume(directory), SAME) == {}
 
 
 # A frit of before: nodes along the space-filling curve, and a checkpoint that says so.
@@ -172,17 +175,18 @@ OLDER = """
 import sys
 from frit.solver import __main__ as solver, checkpoint
 
-build_mesh, checkpoint.FORMAT = solver.build_mesh, 2
-solver.build_mesh = lambda case, ranks, rows: build_mesh(case, ranks, False)
+make_setup, checkpoint.FORMAT = solver.make_setup, 2
+solver.make_setup = lambda case, ranks, rows: make_setup(case, ranks, False)
 """
 
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_checkpoint_of_an_older_frit_goes_on(tmp_path: Path, number: int) -> None:
     """With its own numbers of the nodes: rows, fields and snapshots are those of an older frit that nobody stopped."""
-    whole = solve(PAIR, tmp_path / "whole", script=OLDER + "sys.exit(solver.main())")
+    case = on_mesh(PAIR)
+    whole = solve(case, tmp_path / "whole", script=OLDER + "sys.exit(solver.main())")
     directory = tmp_path / "run"
-    with launch(PAIR, directory, script=OLDER + held_at(17)) as tree:
+    with launch(case, directory, script=OLDER + held_at(17)) as tree:
         until_held(tree, directory, 1, 17)
         tree.process.send_signal(signal.SIGTERM)
         tree.ended()

@@ -70,7 +70,7 @@ def compare(
 
 def compared_here(data: Path, sweep: str, observable: str) -> dict[str, Any]:
     """From the index of a data folder."""
-    from ..http.comparison import ObservableError
+    from ..http.comparison import ROWS, ObservableError, Page
     from ..http.comparison import compare as compare_jobs
     from ..index.migrations import IndexVersionError
     from ..index.records import NotFoundError, StoreError
@@ -81,7 +81,7 @@ def compared_here(data: Path, sweep: str, observable: str) -> dict[str, Any]:
     try:
         store = Store(data, writable=False)
         try:
-            made: Comparison = compare_jobs(store, store.sweep(sweep), observable)
+            made: Comparison = compare_jobs(store, store.sweep(sweep), observable, Page(limit=10**9, rows=ROWS))
         finally:
             store.close()
     except (NotFoundError, IndexVersionError, StoreError) as error:

@@ -45,8 +45,8 @@ def _(scheme: LatticeScheme, state: LatticeState, y: Floats) -> None:
             cause = f"{PRESSED}, or {cause}"
     place = place_of(scheme, float(max(bad[1], bad[2])), found)
     raise RunError(
-        f"at t = {state.time:.6g}, step {state.step}{place}: fields left [{LOWEST:g}, {HIGHEST:g}]: rho up to "
-        f"{max(bad[1], bad[2]):.4g}, eta up to {bad[3]:.4g}, the least {-bad[0]:.4g}; likely cause: {cause}"
+        f"at t = {state.time:.6g}, step {state.step}{place}: fields left [{LOWEST:g}, {HIGHEST:g}]: rho = "
+        f"{max(bad[1], bad[2]):.4g} at most, eta up to {bad[3]:.4g}, the least {-bad[0]:.4g}; likely cause: {cause}"
     )
 
 
@@ -58,7 +58,7 @@ def _(scheme: LatticeScheme, state: LatticeState) -> str | None:
     if not most[0] > HIGHEST:
         return None
     place = place_of(scheme, float(most[0]), found)
-    return f"at t = {state.time:.6g}, step {state.step}{place}: rho = {most[0]:.4g} at a wall: {PRESSED}"
+    return f"at t = {state.time:.6g}, step {state.step}{place}: rho = {most[0]:.4g}, at a wall: {PRESSED}"
 
 
 def extremes(scheme: LatticeScheme) -> Floats:
@@ -81,6 +81,6 @@ def place_of(scheme: LatticeScheme, value: float, found: Floats) -> str:
         p, k, j = (int(i) for i in np.unravel_index(row, (2, len(g.layers), 1 if middle is None else middle.cells)))
         between = [] if middle is None else [middle.points[p, j]]
         at = [fast.points[p, c], *between, slow.points[p, g.layers[k]]]
-        said = f", ({', '.join(f'{x:.3f}' for x in at)}) nm"
+        said = f", at ({', '.join(f'{x:.3f}' for x in at)}) nm"
     texts: list[str] = [text[0] for text in g.ranks.everyones(np.array([said], dtype=object)) if text[0] is not None]
     return texts[0] if texts else ""

@@ -155,9 +155,9 @@ def compiled_functions() -> set[str]:
     """Every function with compiled code of its own, as numba names its files."""
     found = set()
     for name in jit.COMPILED:
-        module = importlib.import_module(f"frit.solver.{name.removesuffix('.py')}")
+        module = importlib.import_module(f"frit.solver.{name.removesuffix('.py').replace('/', '.')}")
         for value in vars(module).values():
             options = getattr(value, "targetoptions", None)
             if options is not None and value.__module__ == module.__name__:
-                found.add(f"{name.removesuffix('.py')}.{value.__name__}")
+                found.add(f"{Path(name).stem}.{value.__name__}")
     return found

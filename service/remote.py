@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,24 +23,56 @@ class Snapshot:
     time: float
 
 
-class RemoteJob:
-    """A job as the service last told it; `refresh` asks again."""
+class Remote:
+    """A job or a sweep as the service last told it; `refresh` asks again."""
+
+    KIND: ClassVar[str]  # in the service's paths
 
     def __init__(self, client: "Client", data: Tree) -> None:
         self.client, self.data = client, data
 
-    def __repr__(self) -> str:
-        return f"<job {self.id} {self.name!r}: {self.state}>"
-
     @property
     def id(self) -> str:
-        """Of the job."""
+        """What the service calls it."""
         return str(self.data["id"])
 
     @property
     def name(self) -> str:
-        """Of the job."""
+        """What its owner calls it."""
         return str(self.data["name"])
+
+    @property
+    def path(self) -> str:
+        """Where the service has it."""
+        return f"/v1/{self.KIND}/{self.id}"
+
+    def refresh(self) -> Self:
+        """Ask again."""
+        self.data = self.client.get(self.path)
+        return self
+
+    def cancel(self) -> Self:
+        """Ask for its end; of a sweep, for that of all its jobs that have not ended."""
+        self.data = self.client.post(f"{self.path}/cancel")
+        return self
+
+    def retry(self) -> Self:
+        """Queue it again, to go on from its checkpoint; of a sweep, all its jobs that ended without success."""
+        self.data = self.client.post(f"{self.path}/retry")
+        return self
+
+    def delete(self) -> None:
+        """Delete it for good, with all files; of a sweep, also the jobs made with it that no other one refers to."""
+        self.client.delete(self.path)
+
+
+class RemoteJob(Remote):
+    """A job."""
+
+    KIND = "jobs"
+
+    def __repr__(self) -> str:
+        return f"<job {self.id} {self.name!r}: {self.state}>"
 
     @property
     def state(self) -> str:
@@ -78,12 +110,7 @@ class RemoteJob:
     @property
     def zarr_url(self) -> str:
         """What zarr and xarray open: `xarray.open_zarr(job.zarr_url)`."""
-        return f"{self.client.url}/v1/jobs/{self.id}/snapshots.zarr"
-
-    def refresh(self) -> Self:
-        """Ask again."""
-        self.data = self.client.get(f"/v1/jobs/{self.id}")
-        return self
+        return f"{self.client.url}{self.path}/snapshots.zarr"
 
     def wait(self, timeout: float | None = None) -> Self:
         """Until it is final, whatever it then is: see `state`. Raises `TimeoutError` after that many seconds."""
@@ -96,11 +123,11 @@ class RemoteJob:
         """The history rows so far, a column per key."""
         import pandas as pd
 
-        return pd.DataFrame(self.client.request("GET", f"/v1/jobs/{self.id}/history").json())
+        return pd.DataFrame(self.client.request("GET", f"{self.path}/history").json())
 
     def stream(self) -> "Iterator[Event]":
         """What has happened and happens, up to its end."""
-        return self.client.events(f"/v1/jobs/{self.id}/events")
+        return self.client.events(f"{self.path}/events")
 
     def log(self, offset: int = 0) -> str:
         """The solver's log from that byte on."""
@@ -110,7 +137,7 @@ class RemoteJob:
         """The same, to be counted: the next offset is the old one and its length."""
         headers = {"Range": f"bytes={offset}-"} if offset else {}
         try:
-            response = self.client.request("GET", f"/v1/jobs/{self.id}/log", headers=headers)
+            response = self.client.request("GET", f"{self.path}/log", headers=headers)
         except self.client.Problem as error:
             if error.status == 416:  # nothing new
                 return b""
@@ -119,22 +146,12 @@ class RemoteJob:
 
     def snapshots(self) -> list[Snapshot]:
         """The complete snapshots; their fields are at `zarr_url`."""
-        found = self.client.get(f"/v1/jobs/{self.id}/snapshots")["snapshots"]
+        found = self.client.get(f"{self.path}/snapshots")["snapshots"]
         return [Snapshot(row["number"], row["time"]) for row in found]
-
-    def cancel(self) -> Self:
-        """Ask for its end."""
-        self.data = self.client.post(f"/v1/jobs/{self.id}/cancel")
-        return self
-
-    def retry(self) -> Self:
-        """Queue it again; it goes on from its checkpoint."""
-        self.data = self.client.post(f"/v1/jobs/{self.id}/retry")
-        return self
 
     def rerun(self) -> "RemoteJob":
         """Queue its case as a new job, from the start."""
-        return RemoteJob(self.client, self.client.post(f"/v1/jobs/{self.id}/rerun"))
+        return RemoteJob(self.client, self.client.post(f"{self.path}/rerun"))
 
     def change(
         self, *, name: str | None = None, priority: int | None = None, tags: Sequence[str] | None = None
@@ -142,43 +159,23 @@ class RemoteJob:
         """Give it another name, priority or other tags."""
         changes = {"name": name, "priority": priority, "tags": None if tags is None else list(tags)}
         given = {key: value for key, value in changes.items() if value is not None}
-        self.data = self.client.request("PATCH", f"/v1/jobs/{self.id}", json=given).json()
+        self.data = self.client.request("PATCH", self.path, json=given).json()
         return self
 
-    def delete(self) -> None:
-        """Delete it, with all its files, for good."""
-        self.client.delete(f"/v1/jobs/{self.id}")
 
+class RemoteSweep(Remote):
+    """A sweep."""
 
-class RemoteSweep:
-    """A sweep as the service last told it; `refresh` asks again."""
-
-    def __init__(self, client: "Client", data: Tree) -> None:
-        self.client, self.data = client, data
+    KIND = "sweeps"
 
     def __repr__(self) -> str:
         return f"<sweep {self.id} {self.name!r}: {self.states}>"
-
-    @property
-    def id(self) -> str:
-        """Of the sweep."""
-        return str(self.data["id"])
-
-    @property
-    def name(self) -> str:
-        """Of the sweep."""
-        return str(self.data["name"])
 
     @property
     def states(self) -> dict[str, int]:
         """How many of its jobs are in which state."""
         states: dict[str, int] = self.data["states"]
         return states
-
-    def refresh(self) -> Self:
-        """Ask again."""
-        self.data = self.client.get(f"/v1/sweeps/{self.id}")
-        return self
 
     def jobs(self, **filters: Any) -> Iterator[RemoteJob]:
         """Its jobs, in the order of their submission."""
@@ -204,25 +201,11 @@ class RemoteSweep:
 
     def compare(self, observable: str = "vacancy_ratio", rows: int = 10_000) -> Tree:
         """An observable of all its jobs over time, in at most so many rows, with the parameters that differ."""
-        found = self.client.get(f"/v1/sweeps/{self.id}/compare", params={"observable": observable, "rows": rows})
+        found = self.client.get(f"{self.path}/compare", params={"observable": observable, "rows": rows})
         while (following := found["next"]) is not None:
             page = self.client.get(following)
             found = {**page, "curves": found["curves"] + page["curves"]}
         return found
-
-    def cancel(self) -> Self:
-        """Ask for the end of all its jobs that have not ended."""
-        self.data = self.client.post(f"/v1/sweeps/{self.id}/cancel")
-        return self
-
-    def retry(self) -> Self:
-        """Queue all its jobs that ended without success again."""
-        self.data = self.client.post(f"/v1/sweeps/{self.id}/retry")
-        return self
-
-    def delete(self) -> None:
-        """Delete it and the jobs that were made with it and that no other sweep refers to."""
-        self.client.delete(f"/v1/sweeps/{self.id}")
 
 
 def looks(timeout: float | None, what: str) -> Iterator[None]:

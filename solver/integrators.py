@@ -245,6 +245,13 @@ class Chebyshev:
         self.radius, self.age = max(MARGIN * radius, 1.0), 0
 
 
+def integrator_of(case: Case, shortest: float, memory: dict[str, float] | None = None) -> Integrator:
+    """The one that the case asks for; shortest: d_min of the paper's step; memory: what a checkpoint kept of it."""
+    if (tolerance := case.time.tolerance) is not None:  # the adaptive integrator has one, rk2 has none
+        return Chebyshev(tolerance, contact_time(shortest, case), memory)
+    return RK2(case.time.step or paper_step(shortest, case))
+
+
 def _total(ranks: Ranks, value: float) -> float:
     return float(ranks.sum(np.array([value]))[0])
 

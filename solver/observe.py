@@ -15,6 +15,7 @@ from .points import on_mesh
 from .scheme import Scheme
 from .simd import LANES
 from .state import State
+from .system import Progress
 
 
 class Observables:
@@ -44,32 +45,46 @@ class Observables:
         d.share.ranks.sum(sums)
         rho = d.sample(np.ascontiguousarray(u[:, :1]))
         extremes = d.share.ranks.max(np.array([-rho.min(initial=np.inf), rho.max(initial=-np.inf)]))
-        volumes = moments[:, 0]
-        row: dict[str, Any] = {
-            "time": time,
-            "step": state.step,
-            "vacancy_ratio": 1.0 - sums[4] / self.box_volume,
-            "solid_mass": sums[0],
-            "free_energy": sums[1],
-            "live_fraction": sums[2] / sums[3],
-            "evaluated_fraction": sums[2] / sums[3],
-            "rho_min": -extremes[0],
-            "rho_max": extremes[1],
-            "particles": int((volumes > 1.0).sum()),
-            "volumes": volumes.tolist(),
-            "evaluations": state.evaluations,
-            "wall_time": wall_time,
-        }
+        fractions = sums[2] / sums[3], sums[2] / sums[3]
+        vacancy_ratio = 1.0 - sums[4] / self.box_volume
+        row = history_row(state, time, wall_time, moments, vacancy_ratio, sums[0], sums[1], fractions, extremes)
         if self.collector is not None:
             row["neck_length"] = self._neck(state, u)
             row["centre_distance"] = distance(moments)
-        return {key: float(value) if isinstance(value, np.floating) else value for key, value in row.items()}
+        return row
 
     def _neck(self, state: State, u: Floats) -> float | None:
         assert self.collector is not None  # narrows the type: only called for a pair
         columns = [0, *(1 + state.slot_of)]
         fields = self.collector.whole(np.ascontiguousarray(u[:, columns]))
         return self.neck.measure(fields) if self.neck is not None and fields is not None else None
+
+
+def history_row(
+    state: Progress, time: float, wall_time: float, moments: Floats, vacancy_ratio: float, solid_mass: float,
+    free_energy: float, fractions: tuple[float, float], extremes: Floats,
+) -> dict[str, Any]:
+    """What every row holds, named as in the run directory's history.jsonl.
+
+    moments (particles, 1 + dim): V_a first; fractions of the points: those that the criterion of 2.4 switches on, those
+    that were evaluated; extremes (2,): -min rho, max rho.
+    """
+    volumes = moments[:, 0]
+    return {
+        "time": time,
+        "step": state.step,
+        "vacancy_ratio": float(vacancy_ratio),
+        "solid_mass": float(solid_mass),
+        "free_energy": float(free_energy),
+        "live_fraction": float(fractions[0]),
+        "evaluated_fraction": float(fractions[1]),
+        "rho_min": float(-extremes[0]),
+        "rho_max": float(extremes[1]),
+        "particles": int((volumes > 1.0).sum()),
+        "volumes": volumes.tolist(),
+        "evaluations": state.evaluations,
+        "wall_time": wall_time,
+    }
 
 
 def free_energy(d: Discretisation, u: Floats) -> float:

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from .case import LATTICES, Case
 from .discretisation import activity, discretise
 from .geometry import Mesh, make_mesh
-from .integrators import RK2, Chebyshev, Integrator, contact_time, paper_step
+from .integrators import Integrator, integrator_of
 from .partition import Ranks
 from .points import on_mesh, with_points
 from .project import project
@@ -48,9 +48,7 @@ def prepare(case: Case, mesh: Mesh, ranks: Ranks, whole: State | None = None) ->
 
 def make_integrator(case: Case, mesh: Mesh, memory: dict[str, float] | None = None) -> Integrator:
     """The integrator that the case asks for; memory: what a checkpoint kept of it."""
-    if (tolerance := case.time.tolerance) is not None:  # the adaptive integrator has one, rk2 has none
-        return Chebyshev(tolerance, contact_time(shortest_distance(case, mesh), case), memory)
-    return RK2(case.time.step or paper_step(shortest_distance(case, mesh), case))
+    return integrator_of(case, shortest_distance(case, mesh), memory)
 
 
 def shortest_distance(case: Case, mesh: Mesh) -> float:

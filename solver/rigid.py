@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .arrays import Floats
-from .elimination import Factors, Plan, factors
+from .arrays import Floats, Integers
+from .contacts import Contacts, contact_stiffness
+from .elimination import Factors, Plan, factors, plan
 from .energy import Coefficients
 from .jit import jit
+from .partition import Ranks
 
 SMALLEST_VOLUME = 1e-3  # nm^dim: a particle that has been consumed has no velocity
 
@@ -68,6 +70,25 @@ def in_space(motion: Floats) -> Floats:
     whole = np.zeros((len(motion), 6))
     whole[:, :2], whole[:, 5] = motion[:, :2], motion[:, 2]
     return whole
+
+
+def stiffness_of(
+    found: Contacts, x: Floats, pairs: Integers, order: Plan, m: Coefficients, huang: bool, ranks: Ranks
+) -> tuple[Floats, Plan]:
+    """How contact forces answer to rigid motion: (pairs, 2, k, k) summed over the ranks, for the pairs that push each
+    other; and the elimination for these, which is `order` where they are the same as before. Collective.
+
+    found, x: this rank's contacts and where they are; pairs (pairs, 2): all that there may be, sorted.
+    """
+    particles, dim = len(order.pivots), x.shape[1]
+    size = dim + rotations(dim)
+    stiffness = np.zeros((len(pairs), 2, size, size))
+    contact_stiffness(stiffness, pairs[:, 0] * particles + pairs[:, 1], found, x, particles, m, huang)
+    ranks.sum(stiffness)
+    pushing = stiffness.any(axis=(1, 2, 3))
+    if not np.array_equal(pairs[pushing], order.pairs):
+        order = plan(pairs[pushing], particles)
+    return stiffness[pushing], order
 
 
 @dataclass(frozen=True)

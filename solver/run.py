@@ -151,7 +151,7 @@ def check(scheme: Any, state: Any, y: Floats) -> None:
     bad = np.flatnonzero(~((fields >= LOWEST) & (fields <= most)).all(axis=1))
     if (first := _lowest(d, bad)) is not None:
         here = np.flatnonzero(d.share.points == first)
-        raise RunError(_said(d.share.ranks, describe(scheme, state, int(here[0])) if here.size else None))
+        raise RunError(first_said(d.share.ranks, describe(scheme, state, int(here[0])) if here.size else None))
 
 
 def _lowest(d: Discretisation, points: Integers) -> int | None:
@@ -176,13 +176,22 @@ def piled_up(scheme: Any, state: Any) -> str | None:
     if not most[0] > HIGHEST:
         return None
     here = np.flatnonzero(rho == most[0])
-    return _said(d.share.ranks, f"{fields_at(scheme, state, int(here[0]))}: {PRESSED}" if here.size else None)
+    return first_said(d.share.ranks, f"{fields_at(scheme, state, int(here[0]))}: {PRESSED}" if here.size else None)
 
 
-def _said(ranks: Ranks, mine: str | None) -> str:
-    """What the first rank that has something to say says. Collective."""
-    said: list[str] = [text[0] for text in ranks.everyones(np.array([mine], dtype=object)) if text[0] is not None]
-    return said[0]
+def first_said(ranks: Ranks, mine: str | None) -> str | None:
+    """What the first rank that has something to say says; None where nobody has. Collective."""
+    texts = (text[0] for text in ranks.everyones(np.array([mine], dtype=object)))
+    return next((text for text in texts if text is not None), None)
+
+
+def likely_cause(case: Case, pressed: bool) -> str:
+    """Of fields out of range; pressed: only rho at a wall is."""
+    cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
+    if not case.model.rigid_motion:
+        return cause
+    cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
+    return f"{PRESSED}, or {cause}" if pressed else cause
 
 
 def fields_at(scheme: Scheme, state: State, point: int) -> str:
@@ -200,13 +209,7 @@ def fields_at(scheme: Scheme, state: State, point: int) -> str:
 
 def describe(scheme: Scheme, state: State, point: int) -> str:
     """Time, step, place and likely cause of a bad field at a point of this rank."""
-    cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
-    if scheme.d.case.model.rigid_motion:
-        cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
-    highest = HIGHEST
     nodes, shares = scheme.d.shape.of(point)
-    if scheme.d.at_wall[point] and shares @ state.rho[nodes] > HIGHEST_AT_WALL:
-        highest = HIGHEST_AT_WALL
-        if scheme.d.case.model.rigid_motion:
-            cause = f"{PRESSED}, or {cause}"
+    pressed = bool(scheme.d.at_wall[point] and shares @ state.rho[nodes] > HIGHEST_AT_WALL)
+    highest, cause = HIGHEST_AT_WALL if pressed else HIGHEST, likely_cause(scheme.d.case, pressed)
     return f"{fields_at(scheme, state, point)} left [{LOWEST:g}, {highest:g}]; likely cause: {cause}"

@@ -109,7 +109,10 @@ class Scheme:
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(a.pairs):
                 self.carried = self.motion
-                self.relax = rigid.relaxation(*self._stiffness(), moments, m, tau, self.carried)
+                stiffness, self.order = rigid.stiffness_of(
+                    self.contacts, d.x, a.pairs, self.order, m, d.huang, d.share.ranks
+                )
+                self.relax = rigid.relaxation(stiffness, self.order, moments, m, tau, self.carried)
             self.motion = self.relax(free)
 
         # Fluxes (20), (21)
@@ -152,20 +155,6 @@ class Scheme:
         """By how much the busiest rank's work exceeds the mean, as a part of it; 0 on one rank. Collective."""
         work, ranks = np.array([self.active.work()]), self.d.share.ranks
         return float(ranks.max(work.copy())[0] * ranks.size / ranks.sum(work)[0] - 1.0)
-
-    def _stiffness(self) -> tuple[Floats, elimination.Plan]:
-        """How the contact forces answer to rigid motion, after `_gather`: (pairs, 2, k, k) summed over the ranks, for
-        the pairs that push each other; and the elimination for these."""
-        d, a = self.d, self.active
-        size = self.motion.shape[1]
-        stiffness = np.zeros((len(a.pairs), 2, size, size))
-        keys = a.pairs[:, 0] * self.particles + a.pairs[:, 1]
-        contacts.contact_stiffness(stiffness, keys, self.contacts, d.x, self.particles, d.coefficients, d.huang)
-        d.share.ranks.sum(stiffness)
-        pushing = stiffness.any(axis=(1, 2, 3))
-        if not np.array_equal(a.pairs[pushing], self.order.pairs):
-            self.order = elimination.plan(a.pairs[pushing], self.particles)
-        return stiffness[pushing], self.order
 
     def _gather(self, y: Floats) -> None:
         """Fields and D of this rank's points in the work arrays, and W summed over the ranks."""

@@ -75,11 +75,9 @@ class Work:
 def work(case: Case) -> Work:
     """The work of a resolved case, as a tree of plain values."""
     h, size = _spacing(case), case["domain"]["size"]
-    in_cell = 4 / sqrt(3) if len(size) == 2 else 4.5 * sqrt(3)  # points per h^dim of the built-in lattices
-    if factored(case):
-        in_cell = 2.0
-    cells = in_cell * prod(size) / h ** len(size)
-    points = points_of(case, cells / amounts.points(1, len(size)), cells)
+    dense = 2 / sqrt(3) if len(size) == 2 else 0.75 * sqrt(3)  # nodes per h^dim: triangular, body-centred
+    nodes = (1.0 if case["nodes"]["source"] == "lattice" else dense) * prod(size) / h ** len(size)
+    points = points_of(case, nodes, amounts.points(nodes, len(size)))
     rows = case["time"]["end"] / case["output"]["history_every"]
     return Work(points, nodes_in_range(case, h), _live(case), evaluations(case), rows)
 
@@ -89,7 +87,7 @@ def points_of(case: Case, nodes: float, cells: float) -> float:
     size, points = case["domain"]["size"], case.get("points", {})  # which cases of old have not
     if factored(case):
         return 2.0 * nodes
-    on_mesh = case["nodes"]["source"] in ("lattice", "triangular") or case["shape_functions"]["kind"] == "linear"
+    on_mesh = case["nodes"]["source"] == "triangular" or case["shape_functions"]["kind"] == "linear"
     if on_mesh or points.get("source") == "cells":
         return cells
     if (pitch := points.get("pitch")) is not None:

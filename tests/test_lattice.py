@@ -214,7 +214,7 @@ def test_the_vacancy_box_is_integrated_exactly() -> None:
 def test_fields_at_the_nodes_are_those_of_the_plain_functions() -> None:
     scheme, state = started(DISCS)
     values = at_nodes(scheme, *field_of(scheme, state.y, 0))
-    nodes = scheme.lattice.positions()
+    nodes = LatticeSetup(scheme.case, Ranks()).positions()
     for a in (0, 30, 150, len(nodes) - 1):  # on walls the field is that of the wall alone
         x, y = (scheme.lattice.axes[k].at(nodes[a, i : i + 1])[0] for k, i in ((2, 0), (0, 1)))  # type: ignore[union-attr]
         assert values.ravel()[a] == pytest.approx(np.kron(y, x) @ whole(scheme, state.y, 0), abs=1e-13)

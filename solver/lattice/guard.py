@@ -3,7 +3,19 @@
 import numpy as np
 
 from ..arrays import Floats
-from ..run import HIGHEST, HIGHEST_AT_WALL, LOWEST, PRESSED, REFRESH, RunError, check, piled_up, renew
+from ..run import (
+    HIGHEST,
+    HIGHEST_AT_WALL,
+    LOWEST,
+    PRESSED,
+    REFRESH,
+    RunError,
+    check,
+    first_said,
+    likely_cause,
+    piled_up,
+    renew,
+)
 from . import loops, windows
 from .axis import GHOSTS
 from .scheme import LatticeScheme, LatticeState
@@ -38,11 +50,7 @@ def _(scheme: LatticeScheme, state: LatticeState, y: Floats) -> None:
     g.ranks.max(bad)
     if bad[0] <= -LOWEST and bad[1] <= HIGHEST and bad[2] <= HIGHEST_AT_WALL and bad[3] <= HIGHEST and bad[4] == 0.0:
         return
-    cause = "the time step is too long for the interface: choose a smaller time.step or time.tolerance"
-    if scheme.case.model.rigid_motion:
-        cause += ", or the rigid motion is too stiff for it: choose a smaller model.m_t"
-        if bad[1] <= HIGHEST and bad[2] > HIGHEST_AT_WALL:
-            cause = f"{PRESSED}, or {cause}"
+    cause = likely_cause(scheme.case, pressed=bool(bad[1] <= HIGHEST and bad[2] > HIGHEST_AT_WALL))
     place = place_of(scheme, float(max(bad[1], bad[2])), found)
     raise RunError(
         f"at t = {state.time:.6g}, step {state.step}{place}: fields left [{LOWEST:g}, {HIGHEST:g}]: rho = "
@@ -82,5 +90,4 @@ def place_of(scheme: LatticeScheme, value: float, found: Floats) -> str:
         between = [] if middle is None else [middle.points[p, j]]
         at = [fast.points[p, c], *between, slow.points[p, g.layers[k]]]
         said = f", at ({', '.join(f'{x:.3f}' for x in at)}) nm"
-    texts: list[str] = [text[0] for text in g.ranks.everyones(np.array([said], dtype=object)) if text[0] is not None]
-    return texts[0] if texts else ""
+    return first_said(g.ranks, said) or ""

@@ -635,6 +635,13 @@ def change(
     back_slow(rate, room.Q, room.spans, w, k, L, T)
 
 
+@lean
+def below(w: int, s: int, r: int, L: Layout) -> int:
+    """Where in rho's window the first place of a row of another window is."""
+    z, x = L.low[w, 0] + s - L.low[0, 0], L.low[w, 2] - L.low[0, 2]
+    return int((z * L.size[0, 1] + L.low[w, 1] + r) * L.size[0, 2] + x)
+
+
 @lean_jit
 def divide(rate: Floats, inverse_mass: Floats, L: Layout, first: int, last: int) -> None:
     """rate /= m_a at the nodes of windows first ... last - 1, and 0 elsewhere in their boxes."""
@@ -645,8 +652,7 @@ def divide(rate: Floats, inverse_mass: Floats, L: Layout, first: int, last: int)
             for r in range(nm):
                 row = L.row[w] + s * nm + r
                 at = L.offset[w] + (s * nm + r) * nf
-                z, x = L.low[w, 0] + s - L.low[0, 0], L.low[w, 2] - L.low[0, 2]
-                node = (z * L.size[0, 1] + L.low[w, 1] + r) * L.size[0, 2] + x
+                node = below(w, s, r, L)
                 begin, end = min(L.begin[row], nf), max(L.end[row], 0)
                 for i in range(begin):
                     rate[0, at + i] = 0.0
@@ -776,8 +782,7 @@ def step_error(
                 if L.end[row] <= L.begin[row]:
                     continue
                 at = L.offset[w] + (s * nm + r) * nf
-                z, x = L.low[w, 0] + s - L.low[0, 0], L.low[w, 2] - L.low[0, 2]
-                node = (z * L.size[0, 1] + L.low[w, 1] + r) * L.size[0, 2] + x
+                node = below(w, s, r, L)
                 square = 0.0
                 volume = 0.0
                 for i in range(L.begin[row], L.end[row]):

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..neck import section
-from ..observe import distance
+from ..observe import distance, history_row
 from ..output import Fields
 from . import loops
 from .axis import Axis
@@ -42,39 +42,28 @@ class LatticeObservables:
         g, m, switch, count = scheme.lattice, scheme.lattice.coefficients, scheme.case.activation, scheme.particles
         held = slice(g.owned.start - g.planes.start, g.owned.stop - g.planes.start)
         rho, slow = g.values(y)[held], self.box[0][g.owned.start : g.owned.stop]
-        mass = g.values(1.0 / np.where(g.inverse_mass > 0.0, g.inverse_mass, np.inf))[held]
+        m_slow, m_middle, m_fast = (sums[0] for sums in g.moments)  # m_a is the sum over p of their products
+        mass = np.einsum("smf,ps,pm,pf->", rho, m_slow[:, g.owned], m_middle, m_fast, optimize=True)
         F, live, least, largest = loops.energy(
             y.reshape(1, -1), scheme.layout, g.tables, scheme.room, m, switch.eps_rho, switch.eps_eta,
             g.layers.start, g.layers.start, g.layers.stop,
         )  # fmt: skip
         box = np.einsum("smf,s,m,f->", rho, slow, self.box[1], self.box[2], optimize=True)
         moments = scheme.moments(y)
-        sums = np.concatenate([[np.vdot(mass, rho), F, live, box], moments.ravel()])
+        sums = np.concatenate([[mass, F, live, box], moments.ravel()])
         if count == 2:
             sums = np.append(sums, neck(scheme, y))
         g.ranks.sum(sums)
         moments = sums[4 : 4 + moments.size].reshape(moments.shape)
         bounds = g.ranks.max(np.array([-least, largest]))
         points = 2.0 * np.prod([axis.cells for axis in g.axes if axis is not None])
-        row: dict[str, Any] = {
-            "time": time,
-            "step": state.step,
-            "vacancy_ratio": 1.0 - sums[3] / self.box_volume,
-            "solid_mass": sums[0],
-            "free_energy": sums[1],
-            "live_fraction": sums[2] / points,
-            "evaluated_fraction": 1.0,
-            "rho_min": -bounds[0],
-            "rho_max": bounds[1],
-            "particles": int((moments[:, 0] > 1.0).sum()),
-            "volumes": moments[:, 0].tolist(),
-            "evaluations": state.evaluations,
-            "wall_time": wall_time,
-        }
+        vacancy_ratio = 1.0 - sums[3] / self.box_volume
+        fractions = sums[2] / points, 1.0
+        row = history_row(state, time, wall_time, moments, vacancy_ratio, sums[0], sums[1], fractions, bounds)
         if count == 2:
-            row["neck_length"] = sums[-1]
+            row["neck_length"] = float(sums[-1])
             row["centre_distance"] = distance(moments)
-        return {key: float(value) if isinstance(value, np.floating) else value for key, value in row.items()}
+        return row
 
 
 def integrals(axis: Axis, low: float, high: float) -> Floats:

@@ -17,6 +17,8 @@ from .axis import GHOSTS, Axis, make_axis
 from .loops import PAD, Points, Room, Tables
 from .windows import Boxes, Layout
 
+Axes = tuple[Axis, Axis | None, Axis]  # slow, middle, fast; in the plane there is no middle one
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -24,7 +26,7 @@ class Lattice:
 
     case: Case
     ranks: Ranks
-    axes: tuple[Axis, Axis | None, Axis]  # slow, middle, fast
+    axes: Axes
     layers: range
     cuts: tuple[int, ...]  # the layers where each rank's begin, and the end
     tables: Tables
@@ -45,8 +47,7 @@ class Lattice:
     @property
     def nodes(self) -> tuple[int, int, int]:
         """Nodes of the whole lattice along slow, middle and fast axis."""
-        slow, middle, fast = self.axes
-        return slow.cells + 1, 1 if middle is None else middle.cells + 1, fast.cells + 1
+        return nodes_of(self.axes)
 
     def planes_of(self, rank: int) -> range:
         """The planes of nodes that a rank holds."""
@@ -67,13 +68,7 @@ class Lattice:
     @property
     def row(self) -> int:
         """The length of a row of rho's window."""
-        return LANES * -(-(self.nodes[2] + 2 * self.reach) // LANES)
-
-    def positions(self) -> Floats:
-        """(n, dim) of the nodes on the planes that this rank holds, nm, the fast axis fastest."""
-        axes = [axis.nodes for axis in self.axes if axis is not None]
-        axes[0] = axes[0][self.planes.start : self.planes.stop]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)[:, ::-1].copy()
+        return windows.whole_packs(self.nodes[2] + 2 * self.reach)
 
     def share(self) -> Share:
         """This rank's nodes, for those who collect nodal values."""
@@ -107,7 +102,13 @@ class Lattice:
         return Halo(self.ranks, int(layout.offset[-1]), neighbours)
 
 
-def axes_of(case: Case) -> tuple[Axis, Axis | None, Axis]:
+def nodes_of(axes: Axes) -> tuple[int, int, int]:
+    """Nodes of the whole lattice along slow, middle and fast axis."""
+    slow, middle, fast = axes
+    return slow.cells + 1, 1 if middle is None else middle.cells + 1, fast.cells + 1
+
+
+def axes_of(case: Case) -> Axes:
     """Slow, middle and fast axis of the case's lattice. Raises `ShapeError`."""
     given, spacing = case.shape_functions, case.nodes.spacing
     assert spacing is not None  # narrows the type: the case was checked
@@ -128,10 +129,10 @@ def cut(work: Floats, parts: int) -> tuple[int, ...]:
     return (*cuts, len(work))
 
 
-def make_lattice(case: Case, ranks: Ranks, work: Floats | None = None) -> Lattice:
+def make_lattice(case: Case, axes: Axes, ranks: Ranks, work: Floats) -> Lattice:
     """This rank's part; work (layers,): what an evaluation costs in each."""
-    axes = slow, middle, fast = axes_of(case)
-    cuts = cut(np.ones(slow.cells) if work is None else work, ranks.size)
+    slow, middle, fast = axes
+    cuts = cut(work, ranks.size)
     layers = range(cuts[ranks.rank], cuts[ranks.rank + 1])
     weight = 0.5 * float(np.prod([axis.step for axis in axes if axis is not None]))
     one, none = np.ones((2, 1, 1)), np.zeros((2, 1, 1))
@@ -197,7 +198,7 @@ class LatticeScheme:
         self.pairs = meeting(boxes)
         rows, width = int(self.layout.size[:, 1].max()), int(self.layout.size[:, 2].max()) + 2 * PAD
         cells = 1 if g.axes[1] is None else g.axes[1].cells
-        P = LANES * -(-g.tables.fast.shape[1] // LANES)
+        P = windows.whole_packs(g.tables.fast.shape[1])
         self.room = Room(
             np.zeros((4 * rows, width)), np.zeros((4 * rows, width)), np.zeros((6, width)), np.zeros((8, width)),
             np.zeros((rows, 2), dtype=np.int64), np.zeros((8 * cells, P)), np.zeros((6 * cells, P)), np.zeros((12, 1)),
@@ -251,7 +252,11 @@ class LatticeScheme:
             free = rigid.velocities(forces, moments, m)
             if tau is not None and len(self.pairs):
                 self.carried = self.motion
-                self.relax = rigid.relaxation(*self._stiffness(), moments, m, tau, self.carried)
+                huang = g.case.model.advection == "huang"
+                stiffness, self.order = rigid.stiffness_of(
+                    self.contacts, self.where, self.pairs, self.order, m, huang, g.ranks
+                )
+                self.relax = rigid.relaxation(stiffness, self.order, moments, m, tau, self.carried)
             self.motion = self.relax(free)
 
         # Fluxes (20), (21)
@@ -319,19 +324,6 @@ class LatticeScheme:
         sums[:, size:] += self.moments(y)
         g.ranks.sum(sums)
         return sums[:, :size], sums[:, size:]
-
-    def _stiffness(self) -> tuple[Floats, elimination.Plan]:
-        """How the contact forces answer to rigid motion: (pairs, 2, k, k) summed over the ranks; the elimination."""
-        g, size = self.lattice, self.motion.shape[1]
-        stiffness = np.zeros((len(self.pairs), 2, size, size))
-        keys = self.pairs[:, 0] * self.particles + self.pairs[:, 1]
-        huang = g.case.model.advection == "huang"
-        contacts.contact_stiffness(stiffness, keys, self.contacts, self.where, self.particles, g.coefficients, huang)
-        g.ranks.sum(stiffness)
-        pushing = stiffness.any(axis=(1, 2, 3))
-        if not np.array_equal(self.pairs[pushing], self.order.pairs):
-            self.order = elimination.plan(self.pairs[pushing], self.particles)
-        return stiffness[pushing], self.order
 
 
 def meeting(boxes: Boxes) -> Integers:

@@ -9,12 +9,12 @@ import numpy as np
 from .. import checkpoint
 from ..arrays import Floats
 from ..case import Case
-from ..integrators import RK2, Chebyshev, Integrator, contact_time, paper_step
+from ..integrators import Integrator, integrator_of
 from ..output import Fields
 from ..partition import Collector, Ranks, Share
 from . import guard, windows
 from .observe import LatticeObservables, nodal
-from .scheme import Lattice, LatticeScheme, LatticeState, axes_of, make_lattice
+from .scheme import Lattice, LatticeScheme, LatticeState, axes_of, make_lattice, nodes_of
 from .start import first_boxes, fitting_boxes, initial_fields, move
 from .windows import Boxes, Layout
 
@@ -45,7 +45,7 @@ class LatticeSetup:
     @property
     def nodes(self) -> int:
         """How many there are."""
-        return int(np.prod([axis.cells + 1 for axis in self.axes if axis is not None]))
+        return int(np.prod(nodes_of(self.axes)))
 
     def positions(self) -> Floats:
         """(n, dim) of all of them, nm: along x, then y, then z."""
@@ -54,8 +54,8 @@ class LatticeSetup:
 
     def start(self, kept: Kept | None = None) -> tuple[LatticeScheme, LatticeState, Integrator]:
         """See `setup.Setup`."""
-        boxes = kept.boxes if kept else first_boxes(self.case, make_lattice(self.case, self.ranks))
-        lattice = make_lattice(self.case, self.ranks, self._work(boxes))
+        boxes = kept.boxes if kept else first_boxes(self.case, self.axes)
+        lattice = make_lattice(self.case, self.axes, self.ranks, self._work(boxes))
         scheme = LatticeScheme(lattice, boxes)
         if kept:
             y = np.zeros(int(scheme.layout.offset[-1]))
@@ -67,7 +67,8 @@ class LatticeSetup:
             if self.case.activation.few_order_parameters:
                 (y,) = move(scheme, fitting_boxes(scheme, y, self.case.activation.eps_eta), y)
             state = LatticeState(0.0, 0, 0, y)
-        return scheme, state, self._integrator(kept.memory if kept else None)
+        shortest = min(axis.step for axis in self.axes if axis is not None)
+        return scheme, state, integrator_of(self.case, shortest, kept.memory if kept else None)
 
     def _work(self, boxes: Boxes) -> Floats:
         """Of each layer of cells."""
@@ -76,12 +77,6 @@ class LatticeSetup:
         for low, size in zip(boxes.low, boxes.size, strict=True):
             work[max(0, low[0] - 1) : low[0] + size[0]] += FIELD_WORK * size[1] * size[2]
         return work
-
-    def _integrator(self, memory: dict[str, float] | None) -> Integrator:
-        shortest = min(axis.step for axis in self.axes if axis is not None)
-        if (tolerance := self.case.time.tolerance) is not None:
-            return Chebyshev(tolerance, contact_time(shortest, self.case), memory)
-        return RK2(self.case.time.step or paper_step(shortest, self.case))
 
     def share(self, system: LatticeScheme) -> Share:
         """This rank's nodes."""
@@ -104,7 +99,7 @@ class LatticeSetup:
     ) -> None:
         """Write the checkpoint."""
         g, boxes = system.lattice, system.boxes
-        mine = windows.lay_out(boxes, g.nodes, g.reach, (g.owned.start, g.owned.stop), g.layers)
+        mine = windows.lay_out(boxes, g.nodes, g.reach, (g.owned.start, g.owned.stop), range(0))
         part = np.zeros(int(mine.offset[-1]))
         windows.carry(part, mine, state.y, system.layout)
         parts = self.ranks.to_root((part, mine))

@@ -6,33 +6,38 @@ from ..arrays import Floats, Integers
 from ..case import Case
 from ..state import TAIL, profile, reach, surface_distance
 from . import windows
-from .scheme import Lattice, LatticeScheme
+from .scheme import Axes, Lattice, LatticeScheme, nodes_of
 from .windows import NONE, Boxes, Layout
 
 MARGIN = 2  # nodes around those where an order parameter is worth keeping
 
 
-def first_boxes(case: Case, lattice: Lattice) -> Boxes:
+def slow_first(place: Floats) -> list[float]:
+    """A place along slow, middle and fast axis: z, y, x, or y, 0, x."""
+    return [place[-1], place[1] if len(place) == 3 else 0.0, place[0]]
+
+
+def first_boxes(case: Case, axes: Axes) -> Boxes:
     """Windows that hold all nodes where the initial eta (34) reaches eps_eta; where few are not wanted, all nodes."""
-    n, dim = lattice.nodes, lattice.dim
+    n = nodes_of(axes)
     centres = np.asarray(case.particles.centres)
     extent = reach(case) + 0.5 * case.particles.interface_width * np.log(1.0 / max(case.activation.eps_eta, TAIL))
-    steps = [axis.step if axis is not None else 1.0 for axis in lattice.axes]
+    steps = [axis.step if axis is not None else 1.0 for axis in axes]
     begins, ends, lows = [], [], []
     for centre, radius in zip(centres, extent, strict=True):
-        at = [centre[-1], centre[1] if dim == 3 else 0.0, centre[0]]
+        at = slow_first(centre)
         if case.activation.few_order_parameters:
             low = [max(0, int(np.floor((at[k] - radius) / steps[k]))) for k in range(3)]
             high = [min(n[k], int(np.ceil((at[k] + radius) / steps[k])) + 1) for k in range(3)]
         else:
             low, high = [0, 0, 0], list(n)
-        if dim == 2:
+        if axes[1] is None:
             low[1], high[1] = 0, 1
         shape = (max(0, high[0] - low[0]), max(0, high[1] - low[1]))
         begins.append(np.full(shape, low[2]))
         ends.append(np.full(shape, high[2]))
         lows.append(np.array(low[:2]))
-    return windows.boxes_of(begins, ends, lows, lattice.reach)
+    return windows.boxes_of(begins, ends, lows, axes[0].reach)
 
 
 def initial_fields(case: Case, lattice: Lattice, layout: Layout) -> Floats:
@@ -45,7 +50,7 @@ def initial_fields(case: Case, lattice: Lattice, layout: Layout) -> Floats:
     axes = [axis.nodes if axis is not None else np.zeros(1) for axis in lattice.axes]
     beyond = radii + 0.5 * xi * np.log(1.0 / TAIL)
     for a, centre in enumerate(np.asarray(case.particles.centres)):
-        at = [centre[-1], centre[1] if lattice.dim == 3 else 0.0, centre[0]]
+        at = slow_first(centre)
         ranges: list[Integers] = []
         for k in range(3):
             near = np.flatnonzero(np.abs(axes[k] - at[k]) <= beyond[a])

@@ -59,13 +59,18 @@ def boxes_of(begin: list[Integers], end: list[Integers], low: list[Integers], re
         first = LANES * ((int(b[there].min())) // LANES) - reach  # as rho's: packs begin at the same nodes
         width = int(e[there].max()) + reach - first
         lows.append(np.array([corner[0] + slow[0], corner[1] + middle[0], first]))
-        sizes.append(np.array([*b.shape, LANES * -(-width // LANES)]))
+        sizes.append(np.array([*b.shape, whole_packs(width)]))
         begins.append(np.where(there, b - first, NONE).ravel())
         ends.append(np.where(there, e - first, 0).ravel())
     size = np.array(sizes, dtype=np.int64).reshape(-1, 3)
     row = np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])])
     low_ = np.array(lows, dtype=np.int64).reshape(-1, 3)
     return Boxes(low_, size, row, joined(begins), joined(ends))
+
+
+def whole_packs(places: int) -> int:
+    """The number of places, rounded up to whole packs."""
+    return LANES * -(-places // LANES)
 
 
 def joined(arrays: list[Integers]) -> Numbers:
@@ -79,7 +84,7 @@ def lay_out(boxes: Boxes, nodes: tuple[int, int, int], reach: int, planes: tuple
     nodes: of the whole lattice along slow, middle, fast.
     """
     first, last = planes
-    width = LANES * -(-(nodes[2] + 2 * reach) // LANES)
+    width = whole_packs(nodes[2] + 2 * reach)
     lows, sizes = [[first, 0, -reach]], [[last - first, nodes[1], width]]
     count = (last - first) * nodes[1]
     begins, ends = [np.full(count, reach)], [np.full(count, reach + nodes[2])]

@@ -1,15 +1,19 @@
-"""`frit` as a user types it: commands in a process of their own, a real `frit serve`."""
+"""`frit` as a user types it: its commands, in this process or in one of their own, and a real `frit serve`."""
 
 import os
 import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from soak import of_data
+from typer.testing import CliRunner
+
+from frit.service.cli.main import app
 
 CASE = """
 name = "sleep 0"
@@ -33,7 +37,16 @@ def command(*words: str) -> list[str]:
 
 
 def frit(*words: str, status: int = 0) -> str:
-    """What a command prints; its exit status must be the one that is expected."""
+    """What a command prints, run in this process; its exit status must be the one that is expected."""
+    done = CliRunner().invoke(app, words)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == status, done.output
+    return done.stdout if status == 0 else done.output
+
+
+def typed(*words: str, status: int = 0) -> str:
+    """`frit` in a process of its own, which takes a second to start."""
     done = subprocess.run(command(*words), capture_output=True, text=True, timeout=WAIT, check=False)
     assert done.returncode == status, done.stdout + done.stderr
     return done.stdout if status == 0 else done.stdout + done.stderr
@@ -50,6 +63,7 @@ def serving(folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
     try:
         while (found := re.search(r"running on (http://\S+)", log.read_text())) is None:
             assert process.poll() is None, log.read_text()
+            time.sleep(0.02)
         os.environ["FRIT_URL"] = found[1]
         yield process
     finally:

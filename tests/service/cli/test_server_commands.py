@@ -6,19 +6,20 @@ import re
 import signal
 import sqlite3
 import subprocess
+import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import CASE, SWEEP, WAIT, command, frit, serving
+from commands import CASE, SWEEP, WAIT, command, frit, serving, typed
 from soak import of_data
 
 
 def test_submit_look_cancel_retry(folder: Path) -> None:
     with serving(folder):
-        done = frit("submit", "case.toml", "--wait", "--tag", "first", "--name", "sleep 0.1")
+        done = typed("submit", "case.toml", "--wait", "--tag", "first", "--name", "sleep 0.1")
         identifier = done.split()[0]
         assert "succeeded" in done
         (row,) = json.loads(frit("jobs", "tag=first", "--json"))
@@ -43,7 +44,7 @@ def test_what_is_refused(folder: Path) -> None:
         assert "none" in frit("show", "nothing", status=2)
         assert "particles.mean_radius" in frit("jobs", "particles.mean_radio.ge=3", status=2)
         assert "must be KEY=VALUE" in frit("jobs", "running", status=2)
-        assert "in use by process" in frit("serve", "--data", "data", "--port", "0", status=2)
+        assert "in use by process" in typed("serve", "--data", "data", "--port", "0", status=2)
         assert "in use by process" in frit("sweep", "run", sweep(folder, "sleep 0"), "--data", "data", status=2)
     assert "no service answers" in frit("jobs", "--url", "http://127.0.0.1:9", status=1)
     assert "access token" in frit("serve", "--data", "data", "--host", "0.0.0.0", "--port", "0", status=2)
@@ -119,6 +120,7 @@ def test_ctrl_c_writes_checkpoints_and_the_same_command_goes_on(folder: Path) ->
     process = subprocess.Popen(command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while len(list((folder / "data").glob("runs/*/calls"))) < 2:
         assert process.poll() is None
+        time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=WAIT)
     assert (process.returncode, "the same command goes on" in said) == (130, True)
@@ -131,7 +133,7 @@ def test_ctrl_c_writes_checkpoints_and_the_same_command_goes_on(folder: Path) ->
 
 def test_a_failed_point_is_told_and_does_not_stop_the_others(folder: Path) -> None:
     file = Path(sweep(folder, "says-no 1"))
-    said = frit("sweep", "run", str(file), "--data", "data", status=1)
+    said = typed("sweep", "run", str(file), "--data", "data", status=1)
     assert said.count("failed") >= 3
     assert "fields left [-0.5, 1.5]" in said
 

@@ -20,6 +20,7 @@ from .windows import Layout
 
 PAD = 24  # places on both sides of a row of work space
 SIX = 6  # taps of the default functions: loops of that length are unrolled
+RHO = np.int32(0)  # the number of rho's window, of the type that others have: a literal 0 would be compiled once more
 
 
 class Tables(NamedTuple):
@@ -368,12 +369,12 @@ def potential(
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
             add_sums(w, k, y, L, T, room)
-        along_slow(True, room.Z, room.spans, y, 0, k, L, T)
+        along_slow(True, room.Z, room.spans, y, RHO, k, L, T)
         clear(room.Q, L.size[0, 1], L.size[0, 2])
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(RHO, k, j, L)
             for p in range(2):
-                along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+                along_middle(True, room.Y, room.Z, room.spans, RHO, j, p, L, T)
             for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
                 touching = False
@@ -397,8 +398,8 @@ def potential(
                 if touching:
                     meet_row(found, where, points, y, kept, k, j, p, first_layer, L, T, room, m)
             for p in range(2):
-                back(room.Q, room.F, room.spans, 0, j, p, b, e, L, T)
-        back_slow(W, room.Q, room.spans, 0, k, L, T)
+                back(room.Q, room.F, room.spans, RHO, j, p, b, e, L, T)
+        back_slow(W, room.Q, room.spans, RHO, k, L, T)
     restore_denormals(mode)
 
 
@@ -437,12 +438,12 @@ def meet_row(
     dim = where.shape[1]
     width = 1 + dim
     fields, here, particle = room.fields, room.here, room.particle
-    b, e = cells_of(0, k, j, L)
+    b, e = cells_of(RHO, k, j, L)
     for q in range(b, e):
         c = L.low[0, 2] + LANES * q
         if not total(positive(load(room.sums, (2 + p) * count + j, GHOSTS + c) - m.c)) > 0.0:
             continue
-        seen = 0
+        seen = np.int64(0)  # a literal would be compiled once more
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
             if (
@@ -546,12 +547,12 @@ def divergence(
             room.swept[:] = 0.0
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             change(L.window[i], k, rate, points, motion, y, L, T, room, m, rigid, huang, first_layer, layers)
-        along_slow(True, room.Z, room.spans, W, 0, k, L, T)
+        along_slow(True, room.Z, room.spans, W, RHO, k, L, T)
         clear(room.Q, L.size[0, 1], L.size[0, 2])
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(RHO, k, j, L)
             for p in range(2):
-                along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+                along_middle(True, room.Y, room.Z, room.spans, RHO, j, p, L, T)
             for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
                 for q in range(b, e):
@@ -573,8 +574,8 @@ def divergence(
                     store(room.F, 4 * p + 2, place, w_p * middle)
                     store(room.F, 4 * p + 3, place, w_p * slow)
             for p in range(2):
-                back(room.Q, room.F, room.spans, 0, j, p, b, e, L, T)
-        back_slow(rate, room.Q, room.spans, 0, k, L, T)
+                back(room.Q, room.F, room.spans, RHO, j, p, b, e, L, T)
+        back_slow(rate, room.Q, room.spans, RHO, k, L, T)
     restore_denormals(mode)
 
 
@@ -723,11 +724,11 @@ def energy(
                             add_to(room.sums, (f + p) * count + j, at, more)
                         steep = load(room.sums, (2 + p) * count + j, at) + positive(square - eps_eta * eps_eta)
                         store(room.sums, (2 + p) * count + j, at, steep)
-        along_slow(True, room.Z, room.spans, y, 0, k, L, T)
+        along_slow(True, room.Z, room.spans, y, RHO, k, L, T)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(RHO, k, j, L)
             for p in range(2):
-                along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+                along_middle(True, room.Y, room.Z, room.spans, RHO, j, p, L, T)
             for p in range(2):
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q

@@ -104,7 +104,7 @@ def lay_out(boxes: Boxes, nodes: tuple[int, int, int], reach: int, planes: tuple
     tops = low[:, 0] + size[:, 0]
     there = np.arange(1, len(low))[size[1:, 0] > 0]
     seen = [there[(low[there, 0] - 1 <= k) & (k < tops[there])] for k in layers]
-    counts = np.concatenate([[0], np.cumsum([len(some) for some in seen])])
+    counts = np.concatenate([[0], np.cumsum([len(some) for some in seen], dtype=np.int64)])
     return Layout(offset, low, size, row, joined(begins), joined(ends), counts, joined(seen))
 
 
@@ -112,20 +112,20 @@ def lay_out(boxes: Boxes, nodes: tuple[int, int, int], reach: int, planes: tuple
 def carry(new: Floats, to: Layout, old: Floats, of: Layout) -> None:
     """Copy all fields from one layout into another, as far as both have them; new is 0 before."""
     for w in range(len(to.low)):
-        shift = to.low[w] - of.low[w]
+        up, aside, ahead = to.low[w, 0] - of.low[w, 0], to.low[w, 1] - of.low[w, 1], to.low[w, 2] - of.low[w, 2]
         for s in range(to.size[w, 0]):
-            z = s + shift[0]
+            z = s + up
             if z < 0 or z >= of.size[w, 0]:
                 continue
             for m in range(to.size[w, 1]):
-                y = m + shift[1]
+                y = m + aside
                 if y < 0 or y >= of.size[w, 1]:
                     continue
                 row, before = to.row[w] + s * to.size[w, 1] + m, of.row[w] + z * of.size[w, 1] + y
-                begin = max(to.begin[row], of.begin[before] - shift[2])
-                end = min(to.end[row], of.end[before] - shift[2])
+                begin = max(to.begin[row], of.begin[before] - ahead)
+                end = min(to.end[row], of.end[before] - ahead)
                 target = to.offset[w] + (s * to.size[w, 1] + m) * to.size[w, 2]
-                source = of.offset[w] + (z * of.size[w, 1] + y) * of.size[w, 2] + shift[2]
+                source = of.offset[w] + (z * of.size[w, 1] + y) * of.size[w, 2] + ahead
                 for i in range(begin, end):
                     new[target + i] = old[source + i]
 

@@ -121,7 +121,24 @@ def _put(typing: Any, address: Any, value: Any) -> Any:
     return types.void(types.intp, pack), generate
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+@intrinsic
+def _fetch(typing: Any, address: Any) -> Any:
+    """fetch(address): bring the line of that address near, for later."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer, kind = ir.IntType(8).as_pointer(), ir.IntType(32)
+        function = builder.module.declare_intrinsic(
+            "llvm.prefetch", (pointer,), ir.FunctionType(ir.VoidType(), [pointer, kind, kind, kind])
+        )
+        reading, soon, data = 0, 2, 1
+        flags = [ir.Constant(kind, flag) for flag in (reading, soon, data)]
+        builder.call(function, [builder.inttoptr(arguments[0], pointer), *flags])
+        return context.get_dummy_value()
+
+    return types.void(types.intp), generate
+
+
+@intrinsic(prefer_literal=True)
 def _from_lane(typing: Any, first: Any, second: Any, lane: Any) -> Any:
     """from_lane(a, b, n): lanes n ... LANES - 1 of a, and after them the first n of b; n is written as a number."""
 
@@ -288,6 +305,7 @@ load = cast(Callable[[Floats, int, int], Pack], _load)
 store = cast(Callable[[Floats, int, int, Pack], None], _store)
 place = cast(Callable[[Floats, int, int], int], _place)
 get = cast(Callable[[int], Pack], _get)
+fetch = cast(Callable[[int], None], _fetch)
 put = cast(Callable[[int, Pack], None], _put)
 from_lane = cast(Callable[[Pack, Pack, int], Pack], _from_lane)
 splat = cast(Callable[[float], Pack], _splat)

@@ -17,6 +17,7 @@ from ..jit import lean, lean_jit
 from ..simd import (
     LANES,
     Pack,
+    fetch,
     flush_denormals,
     from_lane,
     get,
@@ -64,7 +65,6 @@ class Room(NamedTuple):
     F: Floats  # (4, width) of a row of points: source and flux along fast, middle, slow axis
     nothing: Floats  # (1, width) zeros, in the place of rows that a window does not have
     waste: Floats  # (1, width) what goes back to such rows
-    spans: Integers  # (rows, 2) packs of each row that hold anything
     sums: Floats  # (8 cells, P) S1, sum_(b != a) eta_a eta_b, S2, S3 of points 0 and of points 1
     swept: Floats  # (6 cells, P) v_adv along fast, middle, slow axis
     fields: Floats  # (12, 1) of one contact
@@ -90,6 +90,7 @@ class Rows(NamedTuple):
 
 Six = tuple[Pack, Pack, Pack, Pack, Pack, Pack]  # functions in registers
 BYTES = 8  # of a number
+PACK = BYTES * LANES
 
 
 @lean
@@ -125,27 +126,18 @@ def row_of(array: Floats, f: int, r: int, nm: int, instead: Floats) -> int:
 def along_slow(slopes: bool, y: Floats, w: int, k: int, L: Layout, T: Tables, room: Room) -> tuple[int, int]:
     """Z = sum_t N_t u of the planes that layer k sees, for both points; with dN, too, where slopes are wanted.
 
-    spans become the packs of each row in which a node of these planes is in the window; Z is 0 beside them, as far as
-    any row's reach, which is returned.
+    Z is 0 beside a row's span, as far as any other's reaches, which is returned.
     """
-    Z, spans = room.Z, room.spans
+    Z, spans = room.Z, L.spans
     rows = Z.shape[0] // 4
-    nm, nf = L.size[w, 1], L.size[w, 2]
+    nm = L.size[w, 1]
     taps = T.slow.shape[2]
     first = k - taps // 2 + 1 - L.low[w, 0]
-    B, E = nf // LANES, 0
+    seen = L.span[w] + (k - L.layer[w]) * nm
+    B, E = L.size[w, 2] // LANES, 0
     for r in range(nm):
-        begin, end = nf, 0
-        for s in range(max(0, first), min(L.size[w, 0], first + taps)):
-            row = L.row[w] + s * nm + r
-            if L.end[row] > L.begin[row]:
-                begin, end = min(begin, L.begin[row]), max(end, L.end[row])
-        b = begin // LANES
-        e = max(-(-end // LANES), b)
-        spans[r, 0] = b
-        spans[r, 1] = e
-        if e > b:
-            B, E = min(B, b), max(E, e)
+        if spans[seen + r, 1] > spans[seen + r, 0]:
+            B, E = min(B, int(spans[seen + r, 0])), max(E, int(spans[seen + r, 1]))
     for t in range(0, taps, SIX):
         at0, step0 = plane(y, w, first + t, L, room.nothing)
         at1, step1 = plane(y, w, first + t + 1, L, room.nothing)
@@ -158,21 +150,20 @@ def along_slow(slopes: bool, y: Floats, w: int, k: int, L: Layout, T: Tables, ro
         for r in range(nm):
             to0, to1 = place(Z, r, PAD), place(Z, rows + r, PAD)
             to2, to3 = place(Z, 2 * rows + r, PAD), place(Z, 3 * rows + r, PAD)
-            for o in range(BYTES * LANES * spans[r, 0], BYTES * LANES * spans[r, 1], BYTES * LANES):
+            for o in range(PACK * spans[seen + r, 0], PACK * spans[seen + r, 1], PACK):
                 u = (
                     get(at0 + r * step0 + o), get(at1 + r * step1 + o), get(at2 + r * step2 + o),
                     get(at3 + r * step3 + o), get(at4 + r * step4 + o), get(at5 + r * step5 + o),
                 )  # fmt: skip
+                fetch(at5 + (r + 2) * step5 + o)
                 keep(to0 + o, dot(N, u), t)
                 keep(to2 + o, dot(M, u), t)
                 if slopes:
                     keep(to1 + o, dot(dN, u), t)
                     keep(to3 + o, dot(dM, u), t)
     for r in range(nm):
-        for f in range(4):
-            at = place(Z, f * rows + r, PAD)
-            clear(at, B - 2, spans[r, 0])
-            clear(at, max(B, spans[r, 1]), E + 2)
+        clear_four(Z, r, B - 2, min(spans[seen + r, 0], E + 2))
+        clear_four(Z, r, max(B - 2, spans[seen + r, 1]), E + 2)
     return B, E
 
 
@@ -183,28 +174,32 @@ def keep(at: int, sums: Pack, t: int) -> None:
 
 
 @lean
-def clear(at: int, first: int, last: int) -> None:
-    """Set packs first ... last - 1 of a row to 0."""
-    for q in range(first, last):
-        put(at + BYTES * LANES * q, splat(0.0))
+def clear_four(array: Floats, r: int, first: int, last: int) -> None:
+    """Set packs first ... last - 1 of row r to 0 in four arrays."""
+    rows = array.shape[0] // 4
+    one, two = place(array, r, PAD), place(array, rows + r, PAD)
+    three, four = place(array, 2 * rows + r, PAD), place(array, 3 * rows + r, PAD)
+    for o in range(PACK * first, PACK * last, PACK):
+        put(one + o, splat(0.0))
+        put(two + o, splat(0.0))
+        put(three + o, splat(0.0))
+        put(four + o, splat(0.0))
 
 
 @lean
-def along_middle(slopes: bool, w: int, j: int, p: int, L: Layout, T: Tables, room: Room) -> Rows:
+def along_middle(slopes: bool, w: int, k: int, j: int, p: int, L: Layout, T: Tables, room: Room) -> Rows:
     """The sums along the middle axis for the row j of cells, of the rows of nodes that it sees.
 
     They are 0 two packs beyond what they hold. In the plane there is no such axis, and Z is all.
     """
-    Z, Y, spans, nm = room.Z, room.Y, room.spans, L.size[w, 1]
+    Z, Y, nm = room.Z, room.Y, L.size[w, 1]
     taps = T.middle.shape[2]
     if taps == 1:
         value = row_of(Z, 2 * p, 0, nm, room.nothing)
         return Rows(value, value, row_of(Z, 2 * p + 1, 0, nm, room.nothing))
     first = j - taps // 2 + 1 - L.low[w, 1]
-    begin, end = L.size[w, 2], 0
-    for r in range(max(0, first), min(nm, first + taps)):
-        if spans[r, 1] > spans[r, 0]:
-            begin, end = min(begin, spans[r, 0]), max(end, spans[r, 1])
+    cells = row_of_cells(w, k, j, L, T)
+    begin, end = int(L.cells[cells, 2]), int(L.cells[cells, 3])
     to = Rows(place(Y, 0, PAD), place(Y, 1, PAD), place(Y, 2, PAD))
     for t in range(0, taps, SIX):
         r = first + t
@@ -215,7 +210,7 @@ def along_middle(slopes: bool, w: int, j: int, p: int, L: Layout, T: Tables, roo
         a4, d4 = row_of(Z, 2 * p, r + 4, nm, room.nothing), row_of(Z, 2 * p + 1, r + 4, nm, room.nothing)
         a5, d5 = row_of(Z, 2 * p, r + 5, nm, room.nothing), row_of(Z, 2 * p + 1, r + 5, nm, room.nothing)
         N, dN = six(T.middle, p, j, t), six(T.d_middle, p, j, t)
-        for o in range(BYTES * LANES * begin, BYTES * LANES * end, BYTES * LANES):
+        for o in range(PACK * begin, PACK * end, PACK):
             u = get(a0 + o), get(a1 + o), get(a2 + o), get(a3 + o), get(a4 + o), get(a5 + o)
             keep(to.value + o, dot(N, u), t)
             if slopes:
@@ -223,15 +218,23 @@ def along_middle(slopes: bool, w: int, j: int, p: int, L: Layout, T: Tables, roo
                 v = get(d0 + o), get(d1 + o), get(d2 + o), get(d3 + o), get(d4 + o), get(d5 + o)
                 keep(to.slow + o, dot(N, v), t)
     for at in to:
-        clear(at, begin - 2, begin)
-        clear(at, end, end + 2)
+        clear_beside(at, begin, end)
     return to
+
+
+@lean
+def clear_beside(at: int, begin: int, end: int) -> None:
+    """Set two packs on either side of packs begin ... end - 1 of a row to 0."""
+    put(at + PACK * (begin - 2), splat(0.0))
+    put(at + PACK * (begin - 1), splat(0.0))
+    put(at + PACK * end, splat(0.0))
+    put(at + PACK * (end + 1), splat(0.0))
 
 
 @lean
 def column(c: int, T: Tables) -> int:
     """Where cell c is in rows of points: so that packs, which begin `reach` nodes before a whole one, lie in lines."""
-    return GHOSTS + T.fast.shape[0] // 4 + c
+    return int(GHOSTS + T.fast.shape[0] // 4 + c)
 
 
 @lean
@@ -253,7 +256,7 @@ def sum_taps(u: int, step: int, N: int, row: int, taps: int) -> Pack:
 @lean
 def ahead(at: int) -> Six:
     """The packs that begin 2, 1 places before the address, there, and 1, 2, 3 behind it."""
-    left, here, right = get(at - BYTES * LANES), get(at), get(at + BYTES * LANES)
+    left, here, right = get(at - PACK), get(at), get(at + PACK)
     return (
         from_lane(left, here, 6), from_lane(left, here, 7), here,
         from_lane(here, right, 1), from_lane(here, right, 2), from_lane(here, right, 3),
@@ -263,7 +266,7 @@ def ahead(at: int) -> Six:
 @lean
 def behind(at: int) -> Six:
     """The packs that begin 2, 1 places behind the address, there, and 1, 2, 3 before it."""
-    left, here, right = get(at - BYTES * LANES), get(at), get(at + BYTES * LANES)
+    left, here, right = get(at - PACK), get(at), get(at + PACK)
     return (
         from_lane(here, right, 2), from_lane(here, right, 1), here,
         from_lane(left, here, 7), from_lane(left, here, 6), from_lane(left, here, 5),
@@ -308,38 +311,36 @@ def add_to(array: Floats, row: int, column: int, more: Pack) -> None:
 
 
 @lean
-def cells_of(w: int, k: int, j: int, L: Layout) -> tuple[int, int]:
-    """Packs of the row j of layer k in which a cell has a corner in the window, counted as the window's places."""
-    begin, end = 1 << 30, 0
-    nm = L.size[w, 1]
-    for s in range(max(0, k - L.low[w, 0]), min(L.size[w, 0], k - L.low[w, 0] + 2)):
-        for m in range(max(0, j - L.low[w, 1]), min(nm, j - L.low[w, 1] + 2)):
-            row = L.row[w] + s * nm + m
-            begin, end = min(begin, int(L.begin[row])), max(end, int(L.end[row]))
-    return max(begin - 1, 0) // LANES, -(-end // LANES)
+def row_of_cells(w: int, k: int, j: int, L: Layout, T: Tables) -> int:
+    """Which row of `Layout.cells` the row j of layer k has."""
+    m = j - L.low[w, 1] + 1 if T.middle.shape[2] > 1 else 0
+    return int(L.cell[w] + (k - L.layer[w]) * (L.size[w, 1] + 1) + m)
 
 
 @lean
-def back(w: int, j: int, p: int, b: int, e: int, L: Layout, T: Tables, room: Room) -> None:
+def cells_of(w: int, k: int, j: int, L: Layout, T: Tables) -> tuple[int, int]:
+    """Packs of the row j of layer k in which a cell has a corner in the window, counted as the window's places."""
+    row = row_of_cells(w, k, j, L, T)
+    return int(L.cells[row, 0]), int(L.cells[row, 1])
+
+
+@lean
+def back(w: int, k: int, j: int, p: int, b: int, e: int, L: Layout, T: Tables, room: Room) -> None:
     """Q += what the row's packs b ... e - 1 of sources and fluxes give along the fast and the middle axis."""
-    Q, F, spans, nm = room.Q, room.F, room.spans, L.size[w, 1]
+    Q, F, nm = room.Q, room.F, L.size[w, 1]
     taps = T.middle.shape[2]
     first = j - (taps - 1) // 2 - L.low[w, 1]
-    begin, end = e, b
-    for r in range(max(0, first), min(nm, first + taps)):
-        if spans[r, 1] > spans[r, 0]:
-            begin, end = min(begin, int(spans[r, 0])), max(end, int(spans[r, 1]))
-    begin, end = max(begin, b - 1), min(end, e + 1)
+    cells = row_of_cells(w, k, j, L, T)
+    begin, end = max(int(L.cells[cells, 2]), b - 1), min(int(L.cells[cells, 3]), e + 1)
     for f in range(4):
-        clear(place(F, f, PAD), b - 2, b)
-        clear(place(F, f, PAD), e, e + 2)
+        clear_beside(place(F, f, PAD), b, e)
     N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
     if taps == 1:
         one, two = row_of(Q, 2 * p, 0, nm, room.waste), row_of(Q, 2 * p + 1, 0, nm, room.waste)
         for q in range(begin, end):
             source, _, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, N, dN, T)
-            put(one + BYTES * LANES * q, source)
-            put(two + BYTES * LANES * q, slow)
+            put(one + PACK * q, source)
+            put(two + PACK * q, slow)
         return
     for t in range(0, taps, SIX):
         r = first + t
@@ -352,7 +353,7 @@ def back(w: int, j: int, p: int, b: int, e: int, L: Layout, T: Tables, room: Roo
         M, dM = six(T.middle, p, j, t), six(T.d_middle, p, j, t)
         for q in range(begin, end):
             source, middle, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, N, dN, T)
-            o = BYTES * LANES * q
+            o = PACK * q
             more(a0 + o, M[0] * source + dM[0] * middle)
             more(a1 + o, M[1] * source + dM[1] * middle)
             more(a2 + o, M[2] * source + dM[2] * middle)
@@ -397,8 +398,9 @@ def back_fast(F: Floats, q: int, node: int, p: int, N: Six, dN: Six, T: Tables) 
 @lean
 def back_slow(rate: Floats, w: int, k: int, L: Layout, T: Tables, room: Room) -> None:
     """rate += what Q gives to the planes of nodes that layer k sees."""
-    Q, spans = room.Q, room.spans
+    Q, spans = room.Q, L.spans
     rows = Q.shape[0] // 4
+    seen = L.span[w] + (k - L.layer[w]) * L.size[w, 1]
     taps = T.slow.shape[2]
     first = k - taps // 2 + 1 - L.low[w, 0]
     for t in range(0, taps, SIX):
@@ -413,7 +415,8 @@ def back_slow(rate: Floats, w: int, k: int, L: Layout, T: Tables, room: Room) ->
         for r in range(L.size[w, 1]):
             of0, of1 = place(Q, r, PAD), place(Q, rows + r, PAD)
             of2, of3 = place(Q, 2 * rows + r, PAD), place(Q, 3 * rows + r, PAD)
-            for o in range(BYTES * LANES * spans[r, 0], BYTES * LANES * spans[r, 1], BYTES * LANES):
+            for o in range(PACK * spans[seen + r, 0], PACK * spans[seen + r, 1], PACK):
+                fetch(at5 + (r + 2) * step5 + o)
                 a, da, b, db = get(of0 + o), get(of1 + o), get(of2 + o), get(of3 + o)
                 more(at0 + r * step0 + o, N[0] * a + dN[0] * da + M[0] * b + dM[0] * db)
                 more(at1 + r * step1 + o, N[1] * a + dN[1] * da + M[1] * b + dM[1] * db)
@@ -426,9 +429,8 @@ def back_slow(rate: Floats, w: int, k: int, L: Layout, T: Tables, room: Room) ->
 @lean
 def clear_all(array: Floats, nm: int, first: int, last: int) -> None:
     """Set packs first ... last - 1 of all rows of four arrays to 0."""
-    for f in range(4):
-        for r in range(nm):
-            clear(place(array, f * (array.shape[0] // 4) + r, PAD), first, last)
+    for r in range(nm):
+        clear_four(array, r, first, last)
 
 
 @lean_jit
@@ -452,16 +454,16 @@ def potential(
         B, E = along_slow(True, y, 0, k, L, T, room)
         clear_all(room.Q, L.size[0, 1], B, E)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(0, k, j, L, T)
             for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
-                u = along_middle(True, 0, j, p, L, T, room)
+                u = along_middle(True, 0, k, j, p, L, T, room)
                 N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                 touching = splat(0.0)
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
                     at = column(c, T)
-                    rho, d_fast, d_middle, d_slow = all_at(u, BYTES * LANES * q, c, p, N, dN, T)
+                    rho, d_fast, d_middle, d_slow = all_at(u, PACK * q, c, p, N, dN, T)
                     overlap = load(room.sums, (2 + p) * count + j, at)
                     S2 = load(room.sums, (4 + p) * count + j, at)
                     S3 = load(room.sums, (6 + p) * count + j, at)
@@ -475,7 +477,7 @@ def potential(
                     touching = touching + positive(overlap - m.c)
                 if rigid and total(touching) > 0.0:
                     meet_row(found, where, points, y, kept, k, j, p, first_layer, L, T, room, m)
-                back(0, j, p, b, e, L, T, room)
+                back(0, k, j, p, b, e, L, T, room)
         back_slow(W, 0, k, L, T, room)
     restore_denormals(mode)
 
@@ -486,16 +488,16 @@ def add_sums(w: int, k: int, y: Floats, L: Layout, T: Tables, room: Room) -> Non
     count = T.middle.shape[1]
     along_slow(False, y, w, k, L, T, room)
     for j in range(max(0, L.low[w, 1] - 1), min(count, L.low[w, 1] + L.size[w, 1])):
-        b, e = cells_of(w, k, j, L)
+        b, e = cells_of(w, k, j, L, T)
         if e <= b:
             continue
         for p in range(2):
-            u = along_middle(False, w, j, p, L, T, room).value
+            u = along_middle(False, w, k, j, p, L, T, room).value
             N = six(T.inner, p, 0, 0)
             for q in range(b, e):
                 c = L.low[w, 2] + LANES * q
                 at = column(c, T)
-                eta = value_at(u + BYTES * LANES * q, c, p, N, T)
+                eta = value_at(u + PACK * q, c, p, N, T)
                 inside = positive(eta)
                 S1 = load(room.sums, p * count + j, at)
                 overlap = load(room.sums, (2 + p) * count + j, at)
@@ -515,7 +517,7 @@ def meet_row(
     dim = where.shape[1]
     width = 1 + dim
     fields, here, particle = room.fields, room.here, room.particle
-    b, e = cells_of(0, k, j, L)
+    b, e = cells_of(0, k, j, L, T)
     for q in range(b, e):
         c = L.low[0, 2] + LANES * q
         if not total(positive(load(room.sums, (2 + p) * count + j, column(c, T)) - m.c)) > 0.0:
@@ -627,15 +629,15 @@ def divergence(
         B, E = along_slow(True, W, 0, k, L, T, room)
         clear_all(room.Q, L.size[0, 1], B, E)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(0, k, j, L, T)
             for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
-                u = along_middle(True, 0, j, p, L, T, room)
+                u = along_middle(True, 0, k, j, p, L, T, room)
                 N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
                     at = column(c, T)
-                    _, fast, middle, slow = all_at(u, BYTES * LANES * q, c, p, N, dN, T)
+                    _, fast, middle, slow = all_at(u, PACK * q, c, p, N, dN, T)
                     D = load(points.D, kept, at)
                     fast = splat(0.0) - D * fast
                     middle = splat(0.0) - D * middle
@@ -649,7 +651,7 @@ def divergence(
                     store(room.F, 1, PAD + LANES * q, w_p * fast)
                     store(room.F, 2, PAD + LANES * q, w_p * middle)
                     store(room.F, 3, PAD + LANES * q, w_p * slow)
-                back(0, j, p, b, e, L, T, room)
+                back(0, k, j, p, b, e, L, T, room)
         back_slow(rate, 0, k, L, T, room)
     restore_denormals(mode)
 
@@ -668,19 +670,19 @@ def change(
     B, E = along_slow(True, y, w, k, L, T, room)
     clear_all(room.Q, L.size[w, 1], B, E)
     for j in range(max(0, L.low[w, 1] - 1), min(count, L.low[w, 1] + L.size[w, 1])):
-        b, e = cells_of(w, k, j, L)
+        b, e = cells_of(w, k, j, L, T)
         if e <= b:
             continue
         for p in range(2):
             kept = (p * layers + k - first_layer) * count + j
-            u = along_middle(True, w, j, p, L, T, room)
+            u = along_middle(True, w, k, j, p, L, T, room)
             N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
             height, depth = (T.z[p, k], 0.0) if plane else (T.y[p, j], T.z[p, k])
             v_x = motion[a, 0] + motion[a, 4] * depth - motion[a, 5] * height
             for q in range(b, e):
                 c = L.low[w, 2] + LANES * q
                 at = column(c, T)
-                eta, fast, middle, slow = all_at(u, BYTES * LANES * q, c, p, N, dN, T)
+                eta, fast, middle, slow = all_at(u, PACK * q, c, p, N, dN, T)
                 rho, S2 = load(points.rho, kept, at), load(points.S2, kept, at)
                 fast = spread * fast
                 middle = spread * middle
@@ -705,7 +707,7 @@ def change(
                 store(room.F, 1, PAD + LANES * q, fast)
                 store(room.F, 2, PAD + LANES * q, middle)
                 store(room.F, 3, PAD + LANES * q, slow)
-            back(w, j, p, b, e, L, T, room)
+            back(w, k, j, p, b, e, L, T, room)
     back_slow(rate, w, k, L, T, room)
 
 
@@ -785,13 +787,13 @@ def energy(
             w = L.window[i]
             along_slow(True, y, w, k, L, T, room)
             for j in range(max(0, L.low[w, 1] - 1), min(count, L.low[w, 1] + L.size[w, 1])):
-                b, e = cells_of(w, k, j, L)
+                b, e = cells_of(w, k, j, L, T)
                 for p in range(2):
-                    u = along_middle(True, w, j, p, L, T, room)
+                    u = along_middle(True, w, k, j, p, L, T, room)
                     N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                     for q in range(b, e):
                         c = L.low[w, 2] + LANES * q
-                        eta, x, v, z = all_at(u, BYTES * LANES * q, c, p, N, dN, T)
+                        eta, x, v, z = all_at(u, PACK * q, c, p, N, dN, T)
                         at, square = column(c, T), x * x + v * v + z * z
                         for f, more in ((0, square), (4, eta * eta), (6, eta * eta * eta)):
                             add_to(room.sums, (f + p) * count + j, at, more)
@@ -799,14 +801,14 @@ def energy(
                         store(room.sums, (2 + p) * count + j, at, steep)
         along_slow(True, y, 0, k, L, T, room)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(0, k, j, L, T)
             for p in range(2):
-                u = along_middle(True, 0, j, p, L, T, room)
+                u = along_middle(True, 0, k, j, p, L, T, room)
                 N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
                     at = column(c, T)
-                    rho, x, v, z = all_at(u, BYTES * LANES * q, c, p, N, dN, T)
+                    rho, x, v, z = all_at(u, PACK * q, c, p, N, dN, T)
                     square = x * x + v * v + z * z
                     S2, S3 = load(room.sums, (4 + p) * count + j, at), load(room.sums, (6 + p) * count + j, at)
                     density = free_energy_density(rho, S2, S3, m) + 0.5 * m.kappa_rho * square

@@ -206,7 +206,7 @@ class LatticeScheme:
         P = windows.whole_packs(g.tables.fast.shape[1])
         self.room = Room(
             zeros(4 * rows, width), zeros(4 * rows, width), zeros(3, width), zeros(4, width), zeros(1, width),
-            zeros(1, width), np.zeros((rows, 2), dtype=np.int64), zeros(8 * cells, P), zeros(6 * cells, P),
+            zeros(1, width), zeros(8 * cells, P), zeros(6 * cells, P),
             np.zeros((12, 1)), zeros(64, 4 * LANES),
             np.zeros(64, dtype=np.int64),
         )  # fmt: skip

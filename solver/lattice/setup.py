@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .. import checkpoint
-from ..arrays import Floats
+from ..arrays import Floats, zeros
 from ..case import Case
 from ..integrators import Integrator, integrator_of
 from ..output import Fields
@@ -58,7 +58,7 @@ class LatticeSetup:
         lattice = make_lattice(self.case, self.axes, self.ranks, self._work(boxes))
         scheme = LatticeScheme(lattice, boxes)
         if kept:
-            y = np.zeros(int(scheme.layout.offset[-1]))
+            y = zeros(int(scheme.layout.offset[-1]))
             windows.carry(y, scheme.layout, kept.y, whole(lattice, boxes))
             state = LatticeState(*kept.counts, y)
             scheme.motion = kept.motion

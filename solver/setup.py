@@ -7,7 +7,7 @@ import numpy as np
 
 from . import checkpoint
 from .arrays import Floats
-from .case import Case
+from .case import Box, Case
 from .field import at_nodes
 from .geometry import Mesh
 from .integrators import Integrator
@@ -30,11 +30,19 @@ class Rows(Protocol):
 
 
 class Setup(Protocol):
-    """All that depends on where the nodes are. Every method but `positions` is collective."""
+    """All that depends on where the nodes are. Every method but `positions` and `order_parameter` is collective."""
+
+    @property
+    def case(self) -> Case:
+        """With its particles."""
 
     @property
     def nodes(self) -> int:
         """How many there are."""
+
+    @property
+    def grid(self) -> tuple[int, ...] | None:
+        """Nodes along y and x, or z, y and x, where they are rows of a lattice, in their order."""
 
     def positions(self) -> Floats:
         """(n, dim) of all of them, nm."""
@@ -45,11 +53,14 @@ class Setup(Protocol):
     def share(self, system: Any) -> Share:
         """This rank's nodes."""
 
-    def rows(self, system: Any, state: Any) -> Rows:
-        """What computes the history."""
+    def rows(self, system: Any, state: Any, box: Box | None = None) -> Rows:
+        """What computes the history; box: the vacancy box, if not the case's."""
 
     def fields(self, system: Any, state: Any, u: Floats, collector: Collector) -> Fields | None:
         """What a snapshot holds of the nodes of this rank's blocks."""
+
+    def order_parameter(self, system: Any, state: Any, u: Floats, particle: int) -> Floats:
+        """(n,) eta of a particle at all nodes; on a single rank."""
 
     def remarks(self) -> list[str]:
         """What a user should know before the run."""
@@ -80,6 +91,13 @@ class MeshSetup:
         """How many there are."""
         return len(self.mesh.nodes)
 
+    @property
+    def grid(self) -> tuple[int, ...] | None:
+        """See `Setup`: that of linear functions on a square or cubic lattice."""
+        if self.case.nodes.source != "lattice":
+            return None
+        return tuple(len(np.unique(column)) for column in self.mesh.nodes.T[::-1])
+
     def positions(self) -> Floats:
         """(n, dim) of all of them, nm."""
         return self.mesh.nodes
@@ -98,9 +116,9 @@ class MeshSetup:
         """This rank's nodes."""
         return system.d.share
 
-    def rows(self, system: Scheme, state: State) -> Observables:
+    def rows(self, system: Scheme, state: State, box: Box | None = None) -> Observables:
         """What computes the history."""
-        return Observables(self.case, self.mesh, system.d, len(state.slot_of))
+        return Observables(self.case, self.mesh, system.d, len(state.slot_of), box)
 
     def fields(self, system: Scheme, state: State, u: Floats, collector: Collector) -> Fields | None:
         """See `Setup`."""
@@ -109,6 +127,12 @@ class MeshSetup:
         if whole is None or collector.first == collector.last:
             return None
         return fields_of(at_nodes(self.case, self.mesh, slice(collector.first, collector.last), whole), owner)
+
+    def order_parameter(self, system: Scheme, state: State, u: Floats, particle: int) -> Floats:
+        """See `Setup`."""
+        slot = state.slot_of[particle]
+        column = np.where(state.owner[:, slot] == particle, u[:, 1 + slot], 0.0)[:, None]
+        return at_nodes(self.case, self.mesh, slice(None), column)[:, 0]
 
     def remarks(self) -> list[str]:
         """See `Setup`."""

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
+from ..case import Box
 from ..neck import section
 from ..observe import distance, history_row
 from ..output import Fields
@@ -25,9 +26,10 @@ TETRAHEDRA = tuple(
 class LatticeObservables:
     """Computes history rows. Collective; rows exist on rank 0 alone."""
 
-    def __init__(self, scheme: LatticeScheme) -> None:
-        g, output = scheme.lattice, scheme.case.output
-        low, high = (np.asarray(corner, dtype=float) for corner in output.vacancy_box)
+    def __init__(self, scheme: LatticeScheme, box: Box | None = None) -> None:
+        """box: of the vacancy ratio, if not the case's."""
+        g = scheme.lattice
+        low, high = (np.asarray(corner, dtype=float) for corner in box or scheme.case.output.vacancy_box)
         self.box_volume = float(np.prod(high - low))
         corners = (low[::-1], high[::-1]) if g.dim == 3 else (np.insert(low[::-1], 1, 0), np.insert(high[::-1], 1, 0))
         self.box = [
@@ -121,6 +123,16 @@ def nodal(scheme: LatticeScheme, y: Floats) -> Fields:
         particle[here] = np.where(more, w - 1, particle[here])
         squares[here] += eta**2
     return Fields(rho.ravel(), squares.ravel(), np.where(rho >= 0.5, particle, -1).astype(np.int32).ravel())
+
+
+def order_parameter(scheme: LatticeScheme, y: Floats, particle: int) -> Floats:
+    """eta of a particle at this rank's nodes."""
+    eta = np.zeros((len(scheme.lattice.planes), *scheme.lattice.nodes[1:]))
+    values, first = field_of(scheme, y, 1 + particle)
+    if values.size:
+        start = (first[0] - scheme.lattice.planes.start, *first[1:])
+        eta[tuple(slice(f, f + n) for f, n in zip(start, values.shape, strict=True))] = values
+    return at_nodes(scheme, eta, (scheme.lattice.planes.start, 0, 0)).ravel()
 
 
 def neck(scheme: LatticeScheme, y: Floats) -> float:

@@ -8,12 +8,12 @@ import numpy as np
 
 from .. import checkpoint
 from ..arrays import Floats
-from ..case import Case
+from ..case import Box, Case
 from ..integrators import Integrator, integrator_of
 from ..output import Fields
 from ..partition import Collector, Ranks, Share
 from . import guard, windows
-from .observe import LatticeObservables, nodal
+from .observe import LatticeObservables, nodal, order_parameter
 from .scheme import Lattice, LatticeScheme, LatticeState, axes_of, make_lattice, nodes_of
 from .start import first_boxes, fitting_boxes, initial_fields, move
 from .windows import Boxes, Layout
@@ -46,6 +46,11 @@ class LatticeSetup:
     def nodes(self) -> int:
         """How many there are."""
         return int(np.prod(nodes_of(self.axes)))
+
+    @property
+    def grid(self) -> tuple[int, ...]:
+        """Nodes along y and x, or z, y and x."""
+        return tuple(axis.cells + 1 for axis in self.axes if axis is not None)
 
     def positions(self) -> Floats:
         """(n, dim) of all of them, nm: along x, then y, then z."""
@@ -82,13 +87,17 @@ class LatticeSetup:
         """This rank's nodes."""
         return system.lattice.share()
 
-    def rows(self, system: LatticeScheme, state: LatticeState) -> LatticeObservables:
+    def rows(self, system: LatticeScheme, state: LatticeState, box: Box | None = None) -> LatticeObservables:
         """What computes the history."""
-        return LatticeObservables(system)
+        return LatticeObservables(system, box)
 
     def fields(self, system: LatticeScheme, state: LatticeState, u: Floats, collector: Collector) -> Fields:
         """See `setup.Setup`."""
         return Fields(*(collector.blocks(values) for values in nodal(system, u)))
+
+    def order_parameter(self, system: LatticeScheme, state: LatticeState, u: Floats, particle: int) -> Floats:
+        """See `setup.Setup`."""
+        return order_parameter(system, u, particle)
 
     def remarks(self) -> list[str]:
         """See `setup.Setup`."""

@@ -6,9 +6,9 @@ partial sums, and every holder adds them in the order of the ranks, so that all 
 count a node on its *owner*, the lowest rank that holds it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import mpi4py
 import numpy as np
@@ -18,6 +18,8 @@ from .profile import Stopwatch
 
 mpi4py.rc.threads = False
 from mpi4py import MPI  # noqa: E402  (after the settings above)
+
+Thing = TypeVar("Thing")
 
 
 class Ranks:
@@ -59,12 +61,20 @@ class Ranks:
         """Rank 0's object on every rank. For set-up and rare events."""
         return self.comm.bcast(thing) if self.size > 1 else thing
 
-    def to_root(self, thing: Any) -> list[Any] | None:
-        """Every rank's object on rank 0, None elsewhere. For rare events."""
-        if self.size == 1:
-            return [thing]
-        found: list[Any] | None = self.comm.gather(thing)
-        return found
+    def in_turn(self, things: Iterable[Thing]) -> Iterator[Thing]:
+        """On rank 0 everybody's things, one rank after another, each sent when it is wanted; elsewhere none.
+
+        Collective: all ranks must take what comes to the end. For rare events: things travel as Python objects.
+        """
+        if not self.root:
+            for thing in things:
+                self.comm.send(thing, 0)
+            self.comm.send(None, 0)
+            return
+        yield from things
+        for rank in range(1, self.size):
+            while (received := self.comm.recv(source=rank)) is not None:
+                yield received
 
     def barrier(self) -> None:
         """Wait for everyone."""

@@ -44,8 +44,8 @@ class Setup(Protocol):
     def grid(self) -> tuple[int, ...] | None:
         """Nodes along y and x, or z, y and x, where they are rows of a lattice, in their order."""
 
-    def positions(self) -> Floats:
-        """(n, dim) of all of them, nm."""
+    def positions(self, nodes: slice = slice(None)) -> Floats:
+        """(n, dim) of these nodes, nm."""
 
     def start(self, kept: Any = None) -> tuple[Any, Any, Integrator]:
         """System, state and integrator of a fresh run, or of one that goes on from what `read` has given."""
@@ -98,9 +98,9 @@ class MeshSetup:
             return None
         return tuple(len(np.unique(column)) for column in self.mesh.nodes.T[::-1])
 
-    def positions(self) -> Floats:
-        """(n, dim) of all of them, nm."""
-        return self.mesh.nodes
+    def positions(self, nodes: slice = slice(None)) -> Floats:
+        """See `Setup`."""
+        return self.mesh.nodes[nodes]
 
     def start(self, kept: checkpoint.Checkpoint | None = None) -> tuple[Scheme, State, Integrator]:
         """See `Setup`."""

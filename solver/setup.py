@@ -109,7 +109,7 @@ class MeshSetup:
             nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
             state.u[:], _ = repack(kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1])
             if kept.motion is not None:
-                scheme.motion = kept.motion
+                scheme.motion = scheme.carried = kept.motion
         return scheme, state, make_integrator(self.case, self.mesh, kept.memory if kept else None)
 
     def share(self, system: Scheme) -> Share:

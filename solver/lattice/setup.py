@@ -70,7 +70,7 @@ class LatticeSetup:
             for slab, rows in zip(slabs, checkpoint.rows(kept.directory, "y", (s.there for s in slabs)), strict=True):
                 y[slab.here] = rows
             state = LatticeState(*kept.counts, y)
-            scheme.motion = kept.motion
+            scheme.motion = scheme.carried = kept.motion
         else:
             y = initial_fields(self.case, lattice, scheme.layout)
             if self.case.activation.few_order_parameters:

@@ -4,6 +4,7 @@
 but what may be thrown away: compiled code and packings in the user's cache.
 """
 
+import shutil
 import signal
 import sys
 import threading
@@ -30,7 +31,8 @@ from .setup import Setup, make_setup
 from .system import Progress, System
 
 SHOWN_EVERY = 0.25  # seconds between two looks of the progress bar
-WIDTH = 24  # characters of the bar
+WIDTH = 24  # characters of the bar,
+WIDEST = 120  # and of a notebook's line
 
 Observer = Callable[["Moment"], bool | None]
 Given = Case | Mapping[str, Any] | str | Path
@@ -282,6 +284,7 @@ def bar(wanted: bool | None, end: float) -> Iterator[Callable[[Progress, dict[st
 
     def write(line: str) -> None:
         nonlocal length
+        line = line[: WIDEST if notebook else shutil.get_terminal_size().columns - 1]  # none that wraps
         stream.write("\r" + line.ljust(length))
         stream.flush()
         length = len(line)

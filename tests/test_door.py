@@ -162,11 +162,15 @@ def test_packings_are_packed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert result.history["volumes"].shape == (1, 4)
 
 
-def test_a_bar_is_shown_to_those_who_look(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_is_shown_to_those_who_look(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     simulate(SHORT)
     assert capsys.readouterr() == ("", "")
+    monkeypatch.setenv("COLUMNS", "60")
     simulate(SHORT, progress=True)
     said = capsys.readouterr().err
+    assert max(map(len, said.split("\r"))) == 60  # with the end of the line
     assert said.startswith("\rpreparing")
     assert "100%, t = 0.1 of 0.1, step " in said
     assert said.endswith("\n")

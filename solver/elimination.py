@@ -10,13 +10,14 @@ Loops go entry by entry: an operation on whole arrays costs numba a second of co
 """
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from .arrays import Floats, Integers
 from .jit import inlined, jit
 
-FIRST = np.int64(0)  # a literal 0 would be a type of its own, and everything below it compiled once more
+FIRST = cast(int, np.int64(0))  # a literal 0 would be a type of its own, and everything below it compiled once more
 
 
 @dataclass(frozen=True)

@@ -137,6 +137,8 @@ class Chebyshev:
 
     def restart(self, system: System, state: Progress) -> None:
         """Go on from the state's fields; rates known before hold no more."""
+        self.y = self.old = self.rate_0 = self.rate_1 = np.empty(0)  # gives their memory back before more is taken
+        self.work = []
         self.y = system.vector(state)
         self.old, self.rate_0, self.rate_1, *self.work = (zeros(self.y.size) for _ in range(5))
         self.fresh = False

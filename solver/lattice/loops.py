@@ -36,6 +36,7 @@ from .windows import Layout
 PAD = 24  # places on both sides of a row of work space
 SIX = 6  # taps of the default functions: loops of that length are unrolled
 RHO = cast(int, np.int32(0))  # rho's window, of the type that others have: a literal 0 would be compiled once more
+ZERO = cast(int, np.int64(0))  # likewise
 
 
 class Tables(NamedTuple):
@@ -523,7 +524,7 @@ def meet_row(
         c = L.low[0, 2] + LANES * q
         if not total(positive(load(room.sums, (2 + p) * count + j, column(c, T)) - m.c)) > 0.0:
             continue
-        seen = np.int64(0)  # a literal would be compiled once more
+        seen = ZERO
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
             if (

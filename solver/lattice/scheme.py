@@ -10,7 +10,7 @@ from ..arrays import Floats, Integers, zeros
 from ..case import Case
 from ..energy import Coefficients
 from ..geometry import MeshError
-from ..partition import Halo, Ranks, Share
+from ..partition import Halo, Places, Ranks, Share
 from ..simd import LANES
 from . import loops, windows
 from .axis import GHOSTS, Axis, make_axis
@@ -92,18 +92,18 @@ class Lattice:
 
     def halo(self, layout: Layout) -> Halo:
         """The entries of a vector of the layout, or of rho's alone, that other ranks hold, too."""
-        neighbours = []
+        neighbours: list[tuple[int, Places]] = []
         for rank in range(self.ranks.size):
             theirs = self.planes_of(rank)
             if rank == self.ranks.rank or theirs.stop <= self.planes.start or self.planes.stop <= theirs.start:
                 continue
-            parts = []
+            parts: list[slice] = []
             for offset, low, size in zip(layout.offset, layout.low, layout.size, strict=False):
                 begin, end = max(low[0], theirs.start), min(low[0] + size[0], theirs.stop)
-                plane = size[1] * size[2]
-                parts.append(np.arange(offset + max(0, begin - low[0]) * plane, offset + max(0, end - low[0]) * plane))
-            if (common := np.concatenate(parts)).size:
-                neighbours.append((rank, common))
+                if (plane := size[1] * size[2]) and begin < end:
+                    parts.append(slice(int(offset + (begin - low[0]) * plane), int(offset + (end - low[0]) * plane)))
+            if parts:
+                neighbours.append((rank, parts))
         return Halo(self.ranks, int(layout.offset[-1]), neighbours)
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 
 from .arrays import Floats, Integers, Numbers
-from .jit import jit
+from .jit import ONE, ZERO, jit
 
 DEPTH = 16  # of the stack: at most 6 cuts, each replaces the simplex on top by at most 3: 1 + 6 * 2 = 13
-ZERO, ONE = np.int64(0), np.int64(1)  # numbers of simplices and corners: functions are compiled again for a literal
 
 
 def clip_cells(nodes: Floats, cells: Numbers, lower: Floats, upper: Floats) -> tuple[Floats, Floats, Integers]:

@@ -6,21 +6,21 @@ the reverse order. Each of the two points per cell has sums of its own, p = 0 or
 planes of nodes; what is kept of it fits into the cache.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from ..arrays import Floats, Integers
 from ..contacts import FAR, Contacts, add_contact
 from ..energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
-from ..jit import lean, lean_jit
+from ..jit import ZERO, lean, lean_jit
 from ..simd import LANES, Pack, flush_denormals, load, positive, restore_denormals, splat, store, total
 from .axis import GHOSTS as GHOSTS
 from .windows import Layout
 
 PAD = 24  # places on both sides of a row of work space
 SIX = 6  # taps of the default functions: loops of that length are unrolled
-RHO = np.int32(0)  # the number of rho's window, of the type that others have: a literal 0 would be compiled once more
+RHO = cast(int, np.int32(0))  # the number of rho's window, of the type that others have, see `jit.ZERO`
 
 
 class Tables(NamedTuple):
@@ -443,7 +443,7 @@ def meet_row(
         c = L.low[0, 2] + LANES * q
         if not total(positive(load(room.sums, (2 + p) * count + j, GHOSTS + c) - m.c)) > 0.0:
             continue
-        seen = np.int64(0)  # a literal would be compiled once more
+        seen = ZERO
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
             if (

@@ -2,22 +2,24 @@
 
 import hashlib
 import json
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
-from .arrays import Floats
+from .arrays import Array, Floats
 from .durable import replace_durably
 from .geometry import Mesh
-from .partition import Collector
+from .partition import Collector, Ranks
 from .scheme import Scheme
 from .state import State
 from .system import Progress
 
 NAME = "checkpoint.h5"
+PIECE = 16_384  # nodes of a mesh that travel at a time
 FORMAT = 3
 READABLE = (1, 2, 3)  # 1 lacks the rigid motion; in 1 and 2 the nodes of a lattice follow the space-filling curve, and
 # the state in which the live points were chosen is that after the choice, which is not made better by another one
@@ -41,33 +43,69 @@ class Checkpoint:
     wall_time: float
 
 
+class Spread(NamedTuple):
+    """A dataset of which every rank has a part: it is written piece by piece, and whole on no rank."""
+
+    shape: tuple[int, ...]
+    kind: np.dtype[Any]
+    parts: Callable[[], Iterable[tuple[int, Array]]]  # this rank's: the first row of each, and its rows
+
+
+class Head(NamedTuple):
+    """What a checkpoint says beside its fields."""
+
+    state: Progress
+    nodes: int
+    mesh: str  # a fingerprint of what the fields stand on
+    notes: dict[str, Any]  # identity, memory, wall_time
+
+
 def write(
     directory: Path, scheme: Scheme, state: State, collector: Collector, mesh: Mesh, notes: dict[str, Any]
 ) -> None:
-    """Collective; rank 0 writes. notes: identity, memory, wall_time."""
-    fields = {
-        "u": collector.whole(state.u),
-        "owner": collector.whole(state.owner),
-        "reference": collector.whole(scheme.before.u),
-        "reference_owner": collector.whole(scheme.before.owner),
+    """Collective; rank 0 writes. notes: see `Head`."""
+
+    def spread(values: Array) -> Spread:
+        return Spread((len(mesh.nodes), values.shape[1]), values.dtype, lambda: in_pieces(collector, values))
+
+    fields: dict[str, Array | Spread] = {
+        "u": spread(state.u),
+        "owner": spread(state.owner),
+        "reference": spread(scheme.before.u),
+        "reference_owner": spread(scheme.before.owner),
+        "slot_of": state.slot_of,
+        "reference_slot_of": scheme.before.slot_of,
+        "motion": scheme.carried,
     }
-    if not scheme.d.share.ranks.root:
+    store(directory, scheme.d.share.ranks, fields, Head(state, len(mesh.nodes), mesh_hash(mesh), notes))
+
+
+def in_pieces(collector: Collector, values: Array) -> Iterator[tuple[int, Array]]:
+    """The values of this rank's blocks of nodes, and where they begin. Collective."""
+    part = collector.blocks(values)
+    for start in range(0, len(part), PIECE):
+        yield collector.first + start, part[start : start + PIECE]
+
+
+def store(directory: Path, ranks: Ranks, fields: Mapping[str, Array | Spread], head: Head) -> None:
+    """Write beside the old file, make it durable, and rename. Collective; rank 0 writes."""
+    if not ranks.root:
+        for values in fields.values():
+            for _ in ranks.in_turn(values.parts()) if isinstance(values, Spread) else ():
+                pass
         return
-    fields |= {"slot_of": state.slot_of, "reference_slot_of": scheme.before.slot_of, "motion": scheme.carried}
-    store(directory, fields, state, len(mesh.nodes), mesh_hash(mesh), notes)
-
-
-def store(
-    directory: Path, fields: dict[str, Any], state: Progress, nodes: int, mesh: str, notes: dict[str, Any]
-) -> None:
-    """Write beside the old file, make it durable, and rename. mesh: a fingerprint of what the fields stand on."""
-    beside = directory / (NAME + ".new")
+    state, beside = head.state, directory / (NAME + ".new")
     try:
         with h5py.File(beside, "w") as file:
             for name, values in fields.items():
-                file[name] = values
+                if not isinstance(values, Spread):
+                    file[name] = values
+                    continue
+                dataset = file.create_dataset(name, values.shape, values.kind)
+                for first, rows in ranks.in_turn(values.parts()):
+                    dataset[first : first + len(rows)] = rows
             file.attrs.update(format=FORMAT, time=state.time, step=state.step, evaluations=state.evaluations)
-            file.attrs.update(nodes=nodes, mesh=mesh, notes=json.dumps(notes))
+            file.attrs.update(nodes=head.nodes, mesh=head.mesh, notes=json.dumps(head.notes))
     except (KeyError, RuntimeError, ValueError) as error:  # HDF5's words for a disk that is full, among others
         raise OSError(f"{NAME} could not be written: {error}") from error
     replace_durably(beside, directory / NAME)
@@ -83,13 +121,16 @@ def read(directory: Path, identity: str, mesh: Mesh) -> Checkpoint:
 
 
 def load(
-    directory: Path, identity: str, nodes: int, mesh: str
+    directory: Path, identity: str, nodes: int, mesh: str, left: Collection[str] = ()
 ) -> tuple[dict[str, Any], tuple[float, int, int], dict[str, Any]]:
-    """What `store` has written: fields; time, step and evaluations; notes. Raises `CheckpointError`."""
+    """What `store` has written: fields; time, step and evaluations; notes. Raises `CheckpointError`.
+
+    left: names of fields that are left in the file, for `rows`.
+    """
     path = directory / NAME
     try:
         with h5py.File(path) as file:
-            values = {name: dataset[...] for name, dataset in file.items()}
+            values = {name: dataset[...] for name, dataset in file.items() if name not in left}
             attributes = dict(file.attrs)
     except (OSError, KeyError) as error:
         raise CheckpointError(f"{path}: cannot be read as a checkpoint: {error}") from error
@@ -102,6 +143,16 @@ def load(
         then = attributes["nodes"]
         raise CheckpointError(f"{path}: the mesh has changed since: {then} nodes then, {nodes} now")
     return values, (float(attributes["time"]), int(attributes["step"]), int(attributes["evaluations"])), notes
+
+
+def rows(directory: Path, name: str, wanted: Iterable[slice]) -> Iterator[Array]:
+    """Some rows of a field. Raises `CheckpointError`."""
+    try:
+        with h5py.File(directory / NAME) as file:
+            for some in wanted:
+                yield file[name][some]
+    except (OSError, KeyError) as error:
+        raise CheckpointError(f"{directory / NAME}: cannot be read as a checkpoint: {error}") from error
 
 
 def by_rows(directory: Path) -> bool:

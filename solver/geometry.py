@@ -4,13 +4,15 @@ The points integrate (Huang et al. 2023, equations 17-29): x_p is the barycentre
 puts a lattice of points in their place. Lattices, gmsh and mesh files all end in `_build`.
 """
 
+import ctypes
 import io
 import math
 import os
+import signal
 import threading
 import warnings
-from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import permutations
@@ -171,14 +173,26 @@ def gmsh_mesh(size: Sequence[float], spacing: float) -> Mesh:
     with _gmsh_lock:
         if gmsh.isInitialized():
             raise MeshError("gmsh is in use by another part of this process: call gmsh.finalize() first")
-        gmsh.initialize(readConfigFiles=False, interruptible=False)
         try:
-            nodes, cells = _generate(gmsh, box, spacing)
+            with started(gmsh):
+                nodes, cells = _generate(gmsh, box, spacing)
         except Exception as error:  # all that gmsh raises
             raise MeshError(f"gmsh could not mesh a box of {box} with spacing {spacing}: {error}") from error
-        finally:
-            gmsh.finalize()
     return _build(nodes.clip(0.0, box), cells, None)
+
+
+@contextmanager
+def started(gmsh: Any) -> Iterator[None]:
+    """gmsh, started; what the process does about a broken pipe stays as it was, where gmsh would have it killed."""
+    library = ctypes.CDLL(None)  # Python's own signal module works in the main thread alone
+    library.signal.restype, library.signal.argtypes = ctypes.c_void_p, [ctypes.c_int, ctypes.c_void_p]
+    before = library.signal(signal.SIGPIPE, signal.SIG_IGN)
+    gmsh.initialize(readConfigFiles=False, interruptible=False)
+    library.signal(signal.SIGPIPE, before)
+    try:
+        yield
+    finally:
+        gmsh.finalize()
 
 
 def _generate(gmsh: Any, box: tuple[float, ...], spacing: float) -> tuple[Floats, Numbers]:

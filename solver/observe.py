@@ -6,7 +6,7 @@ import numpy as np
 
 from . import block_kernels, box, field, kernels, unknowns
 from .arrays import Floats
-from .case import Case
+from .case import Box, Case
 from .discretisation import Discretisation
 from .geometry import Mesh
 from .neck import Neck
@@ -21,9 +21,10 @@ from .system import Progress
 class Observables:
     """Computes history rows. Every method is collective; rows exist on rank 0 alone."""
 
-    def __init__(self, case: Case, mesh: Mesh, d: Discretisation, particles: int) -> None:
+    def __init__(self, case: Case, mesh: Mesh, d: Discretisation, particles: int, box: Box | None = None) -> None:
+        """box: of the vacancy ratio, if not the case's."""
         self.case, self.d, self.particles = case, d, particles
-        low, high = (np.asarray(corner, dtype=float) for corner in case.output.vacancy_box)
+        low, high = (np.asarray(corner, dtype=float) for corner in box or case.output.vacancy_box)
         self.box_volume = float(np.prod(high - low))
         self.box_weights = box_weights(case, mesh, d, low, high)
         self.pair = particles == 2

@@ -109,16 +109,31 @@ class Snapshots:
     """
 
     def __init__(
-        self, directory: Path, case: Case, positions: Callable[[], Floats], collector: Collector, fresh: bool
+        self, directory: Path, case: Case, positions: Callable[[slice], Floats], collector: Collector, fresh: bool
     ) -> None:
-        """Collective. positions: of all nodes (n, dim); fresh: make the group anew, else go on with the one there."""
+        """Collective. positions: of some nodes (n, dim); fresh: make the group anew, else go on with the one there."""
         self.path, self.collector, self.ranks = directory / "snapshots.zarr", collector, collector.share.ranks
         self.times = case.output.snapshot_times(case.time.end)
         if self.ranks.root and fresh:
-            create_group(self.path, case, positions(), collector.block)
+            create_group(self.path, case, collector.share.total, collector.block)
         elif self.ranks.root:
             for torn in self.path.rglob("*.partial"):  # files that zarr was writing when the run was killed
                 torn.unlink()
+        self.ranks.barrier()
+        if fresh:
+            self._place(positions)
+
+    def _place(self, positions: Callable[[slice], Floats]) -> None:
+        """Write where the nodes are, each rank its blocks, and only then show the group."""
+        import zarr
+
+        stored = zarr.open_array(self.path, path="nodes", mode="r+")
+        for start in range(self.collector.first, self.collector.last, self.collector.block):
+            block = slice(start, min(start + self.collector.block, self.collector.last))
+            stored[block] = positions(block)
+        self.ranks.barrier()
+        if self.ranks.root:
+            consolidate(self.path)
         self.ranks.barrier()
 
     def write(self, number: int, time: float, fields: Fields | None) -> None:
@@ -160,17 +175,15 @@ def fields_of(values: Floats, owner: Numbers) -> Fields:
     return Fields(values[:, 0], (eta**2).sum(axis=1), solid)
 
 
-def create_group(path: Path, case: Case, positions: Floats, block: int) -> None:
-    """An empty group with the positions of the nodes."""
+def create_group(path: Path, case: Case, count: int, block: int) -> None:
+    """An empty group for so many nodes, without consolidated metadata."""
     import zarr
 
     group = zarr.open_group(path, mode="w", zarr_format=3, attributes=ATTRIBUTES | {"name": case.name})
-    count, dim = positions.shape
-    nodes = group.create_array(
-        "nodes", shape=(count, dim), chunks=(block, dim), dtype="float64", dimension_names=("node", "axis"),
+    group.create_array(
+        "nodes", shape=(count, case.dim), chunks=(block, case.dim), dtype="float64", dimension_names=("node", "axis"),
         attributes={"units": "nm", "long_name": "position of the node"},
     )  # fmt: skip
-    nodes[:] = positions
     group.create_array(
         "time", shape=(0,), chunks=(1,), dtype="float64", dimension_names=("time",),
         attributes={"units": "1", "long_name": "model time"}, fill_value=np.nan,
@@ -185,7 +198,6 @@ def create_group(path: Path, case: Case, positions: Floats, block: int) -> None:
             name, shape=(0, count), chunks=(1, block), dtype=kind, dimension_names=("time", "node"),
             attributes={"units": "1", "long_name": words}, fill_value=fill,
         )  # fmt: skip
-    consolidate(path)
 
 
 def grown(path: Path, name: str, length: int) -> Any:

@@ -6,18 +6,22 @@ partial sums, and every holder adds them in the order of the ranks, so that all 
 count a node on its *owner*, the lowest rank that holds it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeVar
 
 import mpi4py
 import numpy as np
 
-from .arrays import Array, Floats, Integers
+from .arrays import Array, Flags, Floats, Integers
 from .profile import Stopwatch
 
 mpi4py.rc.threads = False
 from mpi4py import MPI  # noqa: E402  (after the settings above)
+
+Thing = TypeVar("Thing")
+Places = Integers | list[slice]  # in an array: one by one, or in stretches
 
 
 class Ranks:
@@ -59,12 +63,20 @@ class Ranks:
         """Rank 0's object on every rank. For set-up and rare events."""
         return self.comm.bcast(thing) if self.size > 1 else thing
 
-    def to_root(self, thing: Any) -> list[Any] | None:
-        """Every rank's object on rank 0, None elsewhere. For rare events."""
-        if self.size == 1:
-            return [thing]
-        found: list[Any] | None = self.comm.gather(thing)
-        return found
+    def in_turn(self, things: Iterable[Thing]) -> Iterator[Thing]:
+        """On rank 0 everybody's things, one rank after another, each sent when it is wanted; elsewhere none.
+
+        Collective: all ranks must take what comes to the end. For rare events: things travel as Python objects.
+        """
+        if not self.root:
+            for thing in things:
+                self.comm.send(thing, 0)
+            self.comm.send(None, 0)
+            return
+        yield from things
+        for rank in range(1, self.size):
+            while (received := self.comm.recv(source=rank)) is not None:
+                yield received
 
     def barrier(self) -> None:
         """Wait for everyone."""
@@ -108,21 +120,37 @@ def bisect(points: Floats, weights: Floats, parts: int) -> Integers:
 class Halo:
     """The places of an array that this rank shares with others, and the exchange of values there."""
 
-    def __init__(self, ranks: Ranks, size: int, neighbours: list[tuple[int, Integers]]) -> None:
+    def __init__(self, ranks: Ranks, size: int, neighbours: Sequence[tuple[int, Places]]) -> None:
         """neighbours: other ranks, and where their values belong here, in the same order there."""
-        self.ranks, self.neighbours = ranks, neighbours
-        self.owned, holders = np.ones(size, dtype=bool), np.zeros(size, dtype=np.int32)
-        for rank, common in neighbours:
-            holders[common] += 1
-            if rank < ranks.rank:
-                self.owned[common] = False
-        self.shared = np.flatnonzero(holders)
-        self.in_pairs = bool((holders <= 1).all())  # no place has three holders
+        self.ranks, self.size, self.neighbours = ranks, size, neighbours
+        self.in_pairs = bool((self._others() <= 1).all())  # no place has three holders
+
+    def _others(self) -> Array:
+        """(size,) how many other ranks hold each place."""
+        found = np.zeros(self.size, dtype=np.int16)
+        for _, common in self.neighbours:
+            for some in stretches(common):
+                found[some] += 1
+        return found
+
+    @cached_property
+    def owned(self) -> Flags:
+        """(size,) places that no lower rank holds."""
+        found = np.ones(self.size, dtype=bool)
+        for rank, common in self.neighbours:
+            for some in stretches(common) if rank < self.ranks.rank else ():
+                found[some] = False
+        return found
+
+    @cached_property
+    def shared(self) -> Integers:
+        """Places that other ranks hold, too."""
+        return np.flatnonzero(self._others())
 
     @classmethod
     def of_nodes(cls, ranks: Ranks, nodes: Integers) -> "Halo":
         """nodes: the global numbers of this rank's nodes, sorted. Collective."""
-        neighbours = []
+        neighbours: list[tuple[int, Places]] = []
         for rank, theirs in enumerate(ranks.everyones(nodes)):
             if rank != ranks.rank:
                 common = np.flatnonzero(np.isin(nodes, theirs, assume_unique=True))
@@ -131,10 +159,12 @@ class Halo:
 
     def of(self, places: Integers) -> "Halo":
         """The halo of an array whose entry i belongs to places[i] of this one; all ranks must have the same order."""
-        neighbours, known = [], np.zeros(self.owned.size, dtype=bool)
+        neighbours: list[tuple[int, Places]] = []
+        known = np.zeros(self.size, dtype=bool)
         for rank, common in self.neighbours:
             known[:] = False
-            known[common] = True
+            for some in stretches(common):
+                known[some] = True
             neighbours.append((rank, np.flatnonzero(known[places])))
         return Halo(self.ranks, places.size, neighbours)
 
@@ -157,7 +187,7 @@ class Halo:
             received = exchange.wait()
             if self.in_pairs:  # two numbers have the same sum in any order
                 for (_, common), theirs in zip(self.neighbours, received, strict=True):
-                    array[common] += theirs
+                    add_at(array, common, theirs)
                 return
             mine = array[self.shared]
             array[self.shared] = 0
@@ -166,14 +196,41 @@ class Halo:
                 if waiting and rank > self.ranks.rank:
                     array[self.shared] += mine
                     waiting = False
-                array[common] += theirs
+                add_at(array, common, theirs)
             if waiting:
                 array[self.shared] += mine
 
     def most(self, array: Array) -> None:
         """Replace each shared node's value by the largest of its holders, in place."""
         for (_, common), theirs in zip(self.neighbours, Exchange(self, array).wait(), strict=True):
-            array[common] = np.maximum(array[common], theirs)
+            for some, values in parts_of(common, theirs):
+                array[some] = np.maximum(array[some], values)
+
+
+def stretches(places: Places) -> list[Any]:
+    """What arrays take in their brackets: the numbers of all places, or one slice after another."""
+    return places if isinstance(places, list) else [places]
+
+
+def taken(array: Array, places: Places) -> Array:
+    """A copy of what is there."""
+    return np.concatenate([array[some] for some in places]) if isinstance(places, list) else array[places]
+
+
+def parts_of(places: Places, values: Array) -> Iterator[tuple[Any, Array]]:
+    """The values of each stretch."""
+    if not isinstance(places, list):
+        yield places, values
+        return
+    at = 0
+    for some in places:
+        yield some, values[at : (at := at + some.stop - some.start)]
+
+
+def add_at(array: Array, places: Places, values: Array) -> None:
+    """Add values to an array at places that are all different."""
+    for some, part in parts_of(places, values):
+        array[some] += part
 
 
 class Exchange:
@@ -182,7 +239,7 @@ class Exchange:
     def __init__(self, halo: Halo, array: Array) -> None:
         """Sends the array's values at the nodes shared with each neighbour, and awaits its."""
         comm = halo.ranks.comm
-        self.sent = [array[common] for _, common in halo.neighbours]
+        self.sent = [taken(array, common) for _, common in halo.neighbours]
         self.received = [np.empty_like(values) for values in self.sent]
         pairs = list(zip(halo.neighbours, self.received, self.sent, strict=True))
         self.requests = [comm.Irecv(theirs, rank) for (rank, _), theirs, _ in pairs]

@@ -7,7 +7,7 @@ import numpy as np
 
 from . import checkpoint
 from .arrays import Floats
-from .case import Case
+from .case import Box, Case
 from .field import at_nodes
 from .geometry import Mesh
 from .integrators import Integrator
@@ -30,14 +30,22 @@ class Rows(Protocol):
 
 
 class Setup(Protocol):
-    """All that depends on where the nodes are. Every method but `positions` is collective."""
+    """All that depends on where the nodes are. Every method but `positions` and `order_parameter` is collective."""
+
+    @property
+    def case(self) -> Case:
+        """With its particles."""
 
     @property
     def nodes(self) -> int:
         """How many there are."""
 
-    def positions(self) -> Floats:
-        """(n, dim) of all of them, nm."""
+    @property
+    def grid(self) -> tuple[int, ...] | None:
+        """Nodes along y and x, or z, y and x, where they are rows of a lattice, in their order."""
+
+    def positions(self, nodes: slice = slice(None)) -> Floats:
+        """(n, dim) of these nodes, nm."""
 
     def start(self, kept: Any = None) -> tuple[Any, Any, Integrator]:
         """System, state and integrator of a fresh run, or of one that goes on from what `read` has given."""
@@ -45,11 +53,14 @@ class Setup(Protocol):
     def share(self, system: Any) -> Share:
         """This rank's nodes."""
 
-    def rows(self, system: Any, state: Any) -> Rows:
-        """What computes the history."""
+    def rows(self, system: Any, state: Any, box: Box | None = None) -> Rows:
+        """What computes the history; box: the vacancy box, if not the case's."""
 
     def fields(self, system: Any, state: Any, u: Floats, collector: Collector) -> Fields | None:
         """What a snapshot holds of the nodes of this rank's blocks."""
+
+    def order_parameter(self, system: Any, state: Any, u: Floats, particle: int) -> Floats:
+        """(n,) eta of a particle at all nodes; on a single rank."""
 
     def remarks(self) -> list[str]:
         """What a user should know before the run."""
@@ -80,9 +91,16 @@ class MeshSetup:
         """How many there are."""
         return len(self.mesh.nodes)
 
-    def positions(self) -> Floats:
-        """(n, dim) of all of them, nm."""
-        return self.mesh.nodes
+    @property
+    def grid(self) -> tuple[int, ...] | None:
+        """See `Setup`: that of linear functions on a square or cubic lattice."""
+        if self.case.nodes.source != "lattice":
+            return None
+        return tuple(len(np.unique(column)) for column in self.mesh.nodes.T[::-1])
+
+    def positions(self, nodes: slice = slice(None)) -> Floats:
+        """See `Setup`."""
+        return self.mesh.nodes[nodes]
 
     def start(self, kept: checkpoint.Checkpoint | None = None) -> tuple[Scheme, State, Integrator]:
         """See `Setup`."""
@@ -91,16 +109,16 @@ class MeshSetup:
             nodes = scheme.d.share.nodes  # the slots that this run gives to the particles need not be those it had
             state.u[:], _ = repack(kept.state.u[nodes], kept.state.owner[nodes], state.slot_of, state.u.shape[1])
             if kept.motion is not None:
-                scheme.motion = kept.motion
+                scheme.motion = scheme.carried = kept.motion
         return scheme, state, make_integrator(self.case, self.mesh, kept.memory if kept else None)
 
     def share(self, system: Scheme) -> Share:
         """This rank's nodes."""
         return system.d.share
 
-    def rows(self, system: Scheme, state: State) -> Observables:
+    def rows(self, system: Scheme, state: State, box: Box | None = None) -> Observables:
         """What computes the history."""
-        return Observables(self.case, self.mesh, system.d, len(state.slot_of))
+        return Observables(self.case, self.mesh, system.d, len(state.slot_of), box)
 
     def fields(self, system: Scheme, state: State, u: Floats, collector: Collector) -> Fields | None:
         """See `Setup`."""
@@ -109,6 +127,12 @@ class MeshSetup:
         if whole is None or collector.first == collector.last:
             return None
         return fields_of(at_nodes(self.case, self.mesh, slice(collector.first, collector.last), whole), owner)
+
+    def order_parameter(self, system: Scheme, state: State, u: Floats, particle: int) -> Floats:
+        """See `Setup`."""
+        slot = state.slot_of[particle]
+        column = np.where(state.owner[:, slot] == particle, u[:, 1 + slot], 0.0)[:, None]
+        return at_nodes(self.case, self.mesh, slice(None), column)[:, 0]
 
     def remarks(self) -> list[str]:
         """See `Setup`."""

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Integers
+from ..case import Box
 from ..neck import section
 from ..observe import distance, history_row
 from ..output import Fields
@@ -12,6 +13,7 @@ from . import loops
 from .axis import Axis
 from .scheme import LatticeScheme, LatticeState
 
+PRESENT = 0.01  # a neck is where both order parameters are more; in its solid they are much more
 GAUSS = 8  # points per cell of the integral over the vacancy box
 
 # A square cut into two triangles, a cube into six tetrahedra along its diagonal: corners, slow axis first
@@ -25,9 +27,10 @@ TETRAHEDRA = tuple(
 class LatticeObservables:
     """Computes history rows. Collective; rows exist on rank 0 alone."""
 
-    def __init__(self, scheme: LatticeScheme) -> None:
-        g, output = scheme.lattice, scheme.case.output
-        low, high = (np.asarray(corner, dtype=float) for corner in output.vacancy_box)
+    def __init__(self, scheme: LatticeScheme, box: Box | None = None) -> None:
+        """box: of the vacancy ratio, if not the case's."""
+        g = scheme.lattice
+        low, high = (np.asarray(corner, dtype=float) for corner in box or scheme.case.output.vacancy_box)
         self.box_volume = float(np.prod(high - low))
         corners = (low[::-1], high[::-1]) if g.dim == 3 else (np.insert(low[::-1], 1, 0), np.insert(high[::-1], 1, 0))
         self.box = [
@@ -43,14 +46,14 @@ class LatticeObservables:
         held = slice(g.owned.start - g.planes.start, g.owned.stop - g.planes.start)
         rho, slow = g.values(y)[held], self.box[0][g.owned.start : g.owned.stop]
         m_slow, m_middle, m_fast = (sums[0] for sums in g.moments)  # m_a is the sum over p of their products
-        mass = np.einsum("smf,ps,pm,pf->", rho, m_slow[:, g.owned], m_middle, m_fast, optimize=True)
+        along = rho @ np.stack([*m_fast, self.box[2]], axis=1)  # the sums of rows, then those of planes
+        mass, box = sum(m_slow[p, g.owned] @ along[:, :, p] @ m_middle[p] for p in range(2)), slow @ along[:, :, 2]
         F, live, least, largest = loops.energy(
             y.reshape(1, -1), scheme.layout, g.tables, scheme.room, m, switch.eps_rho, switch.eps_eta,
             g.layers.start, g.layers.start, g.layers.stop,
         )  # fmt: skip
-        box = np.einsum("smf,s,m,f->", rho, slow, self.box[1], self.box[2], optimize=True)
         moments = scheme.moments(y)
-        sums = np.concatenate([[mass, F, live, box], moments.ravel()])
+        sums = np.concatenate([[mass, F, live, box @ self.box[1]], moments.ravel()])
         if count == 2:
             sums = np.append(sums, neck(scheme, y))
         g.ranks.sum(sums)
@@ -78,7 +81,7 @@ def integrals(axis: Axis, low: float, high: float) -> Floats:
 def at_nodes(scheme: LatticeScheme, values: Floats, first: tuple[int, int, int]) -> Floats:
     """The field at the nodes where these are its coefficients: values (slow, middle, fast), the first node's place.
 
-    Beside the array the coefficients count as 0.
+    Beside the array the coefficients count as 0. Several fields at once: values (slow, middle, fast, fields).
     """
     for k, axis in enumerate(scheme.lattice.axes):
         if axis is None:
@@ -87,10 +90,11 @@ def at_nodes(scheme: LatticeScheme, values: Floats, first: tuple[int, int, int])
         scheme.at_nodes[k] = table
         count, reach = values.shape[k], axis.reach
         moved = np.moveaxis(values, k, 0)
-        padded = np.pad(moved, [(reach - 1, reach - 1), (0, 0), (0, 0)])
-        found = np.zeros_like(moved)
+        padded = np.zeros((count + 2 * reach - 2, *moved.shape[1:]))
+        padded[reach - 1 : reach - 1 + count] = moved
+        found, shares = np.zeros_like(moved), table[first[k] : first[k] + count]
         for t in range(2 * reach - 1):
-            found += table[first[k] : first[k] + count, t, None, None] * padded[t : t + count]
+            found += shares[:, t].reshape(-1, *[1] * (moved.ndim - 1)) * padded[t : t + count]
         values = np.moveaxis(found, 0, k)
     return values
 
@@ -123,6 +127,42 @@ def nodal(scheme: LatticeScheme, y: Floats) -> Fields:
     return Fields(rho.ravel(), squares.ravel(), np.where(rho >= 0.5, particle, -1).astype(np.int32).ravel())
 
 
+def order_parameter(scheme: LatticeScheme, y: Floats, particle: int) -> Floats:
+    """eta of a particle at this rank's nodes."""
+    eta = np.zeros((len(scheme.lattice.planes), *scheme.lattice.nodes[1:]))
+    values, first = field_of(scheme, y, 1 + particle)
+    if values.size:
+        start = (first[0] - scheme.lattice.planes.start, *first[1:])
+        eta[tuple(slice(f, f + n) for f, n in zip(start, values.shape, strict=True))] = values
+    return at_nodes(scheme, eta, (scheme.lattice.planes.start, 0, 0)).ravel()
+
+
+Placed = tuple[Floats, tuple[int, int, int]]  # coefficients, and the place of the first
+
+
+def within(values: Floats, first: tuple[int, int, int], low: Integers, high: Integers) -> Floats:
+    """Coefficients on the nodes low ... high - 1, 0 where there are none."""
+    found = np.zeros(high - low)
+    begin, end = np.maximum(low, first), np.minimum(high, np.add(first, values.shape))
+    if (begin < end).all():
+        here = tuple(slice(b, e) for b, e in zip(begin - low, end - low, strict=True))
+        found[here] = values[tuple(slice(b, e) for b, e in zip(begin - first, end - first, strict=True))]
+    return found
+
+
+def contact_box(etas: list[Placed]) -> tuple[Integers, Integers] | None:
+    """First node and end of the box where two order parameters are more than `PRESENT`; None: there is none."""
+    low = np.max([first for _, first in etas], axis=0)
+    high = np.min([np.add(first, values.shape) for values, first in etas], axis=0)
+    if (high <= low).any():
+        return None
+    both = np.logical_and(*(within(*each, low, high) > PRESENT for each in etas))
+    if not both.any():
+        return None
+    there = [np.flatnonzero(both.any(axis=tuple(k for k in range(3) if k != axis))) for axis in range(3)]
+    return low + [nodes[0] for nodes in there], low + [nodes[-1] + 1 for nodes in there]
+
+
 def neck(scheme: LatticeScheme, y: Floats) -> float:
     """This rank's part of the neck of two particles: the measure of {eta_1 = eta_2, rho > 1/2}, nm^(dim - 1).
 
@@ -130,33 +170,24 @@ def neck(scheme: LatticeScheme, y: Floats) -> float:
     """
     g = scheme.lattice
     fields = [field_of(scheme, y, w) for w in range(3)]
-    low = np.max([first for _, first in fields[1:]], axis=0)
-    high = np.min([np.array(first) + values.shape for values, first in fields[1:]], axis=0)
+    found = contact_box(fields[1:])
+    if found is None:
+        return 0.0
+    low, high = np.maximum(found[0] - g.reach, 0), np.minimum(found[1] + g.reach, g.nodes)
     low[0], high[0] = max(low[0], g.layers.start), min(high[0], g.layers.stop + 1)
     if (high - low < np.array([2, 1 if g.dim == 2 else 2, 2])).any():
         return 0.0
-    there = []
-    for values, first in fields:
-        reach = g.reach
-        begin = [max(0, low[k] - first[k] - reach) for k in range(3)]
-        part = values[tuple(slice(begin[k], high[k] - first[k] + reach) for k in range(3))]
-        place = tuple(first[k] + begin[k] for k in range(3))
-        whole = at_nodes(scheme, part, (place[0], place[1], place[2]))
-        there.append(whole[tuple(slice(low[k] - place[k], high[k] - place[k]) for k in range(3))])
-    u = np.stack(there, axis=-1)
-    cuts = TRIANGLES if g.dim == 2 else TETRAHEDRA
-    axes = [axis.nodes[low[k] : high[k]] if axis is not None else np.zeros(1) for k, axis in enumerate(g.axes)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)[..., [0, 2] if g.dim == 2 else [0, 1, 2]]
+    seen = np.maximum(low - g.reach + 1, 0), np.minimum(high + g.reach - 1, g.nodes)
+    whole = at_nodes(scheme, np.stack([within(*each, *seen) for each in fields], axis=-1), (*seen[0].tolist(),))
+    u = whole[tuple(slice(a - b, c - b) for a, b, c in zip(low, seen[0], high, strict=True))]
+    corners = np.array(TRIANGLES if g.dim == 2 else TETRAHEDRA)
     count = np.array(u.shape[:3]) - np.array([1, 0 if g.dim == 2 else 1, 1])
-    most = np.full(count, -np.inf)[..., None]
-    for corner in {corner for cut in cuts for corner in cut}:
-        most = np.maximum(most, u[tuple(slice(c, c + n) for c, n in zip(corner, count, strict=True))])
-    near = (most[..., 0] > 0.2) & (most[..., 1] > 0.01) & (most[..., 2] > 0.01)
-    cells = np.argwhere(near)
-    if not len(cells):
+    solid, ahead = u[..., 0] > 0.5, u[..., 1] > u[..., 2]
+    places = [tuple(map(slice, corner, corner + count)) for corner in np.array([*np.ndindex(2, g.dim - 1, 2)])]
+    cut = np.logical_or.reduce([ahead[c] for c in places]) & ~np.logical_and.reduce([ahead[c] for c in places])
+    cut &= np.logical_or.reduce([solid[c] for c in places])
+    nodes = (np.argwhere(cut)[:, None, None] + corners).reshape(-1, g.dim + 1, 3)
+    if not len(nodes):
         return 0.0
-    total = 0.0
-    for cut in cuts:
-        places = [tuple((cells + np.array(corner)).T) for corner in cut]
-        total += section(np.stack([grid[p] for p in places], axis=1), np.stack([u[p] for p in places], axis=1))
-    return total
+    x = [axis.nodes[low[k] + nodes[..., k]] for k, axis in enumerate(g.axes) if axis is not None]
+    return section(np.stack(x, axis=-1), u[nodes[..., 0], nodes[..., 1], nodes[..., 2]])

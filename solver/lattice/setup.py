@@ -1,19 +1,20 @@
 """From a case to a run on a lattice, and its checkpoints."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .. import checkpoint
-from ..arrays import Floats
-from ..case import Case
+from ..arrays import Array, Floats, Integers, zeros
+from ..case import Box, Case
 from ..integrators import Integrator, integrator_of
 from ..output import Fields
 from ..partition import Collector, Ranks, Share
-from . import guard, windows
-from .observe import LatticeObservables, nodal
+from . import guard
+from .observe import LatticeObservables, nodal, order_parameter
 from .scheme import Lattice, LatticeScheme, LatticeState, axes_of, make_lattice, nodes_of
 from .start import first_boxes, fitting_boxes, initial_fields, move
 from .windows import Boxes, Layout
@@ -25,9 +26,9 @@ FIELD_WORK = 1.0  # of one cell for one field, in an evaluation
 
 @dataclass(frozen=True)
 class Kept:
-    """What a checkpoint holds: the fields on the whole lattice, and their windows."""
+    """What a checkpoint holds; its fields stay in the file until each rank takes its part."""
 
-    y: Floats
+    directory: Path
     boxes: Boxes
     counts: tuple[float, int, int]
     memory: dict[str, float]
@@ -47,10 +48,16 @@ class LatticeSetup:
         """How many there are."""
         return int(np.prod(nodes_of(self.axes)))
 
-    def positions(self) -> Floats:
-        """(n, dim) of all of them, nm: along x, then y, then z."""
+    @property
+    def grid(self) -> tuple[int, ...]:
+        """Nodes along y and x, or z, y and x."""
+        return tuple(axis.cells + 1 for axis in self.axes if axis is not None)
+
+    def positions(self, nodes: slice = slice(None)) -> Floats:
+        """See `setup.Setup`: along x, then y, then z."""
+        places = np.unravel_index(np.arange(*nodes.indices(self.nodes)), self.grid)
         axes = [axis.nodes for axis in self.axes if axis is not None]
-        return np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1).reshape(-1, len(axes))
+        return np.stack([axis[place] for axis, place in zip(axes, places, strict=True)][::-1], axis=-1)
 
     def start(self, kept: Kept | None = None) -> tuple[LatticeScheme, LatticeState, Integrator]:
         """See `setup.Setup`."""
@@ -58,10 +65,12 @@ class LatticeSetup:
         lattice = make_lattice(self.case, self.axes, self.ranks, self._work(boxes))
         scheme = LatticeScheme(lattice, boxes)
         if kept:
-            y = np.zeros(int(scheme.layout.offset[-1]))
-            windows.carry(y, scheme.layout, kept.y, whole(lattice, boxes))
+            y = zeros(int(scheme.layout.offset[-1]))
+            slabs = list(slabs_of(lattice, scheme.layout, boxes, lattice.planes))
+            for slab, rows in zip(slabs, checkpoint.rows(kept.directory, "y", (s.there for s in slabs)), strict=True):
+                y[slab.here] = rows
             state = LatticeState(*kept.counts, y)
-            scheme.motion = kept.motion
+            scheme.motion = scheme.carried = kept.motion
         else:
             y = initial_fields(self.case, lattice, scheme.layout)
             if self.case.activation.few_order_parameters:
@@ -82,13 +91,17 @@ class LatticeSetup:
         """This rank's nodes."""
         return system.lattice.share()
 
-    def rows(self, system: LatticeScheme, state: LatticeState) -> LatticeObservables:
+    def rows(self, system: LatticeScheme, state: LatticeState, box: Box | None = None) -> LatticeObservables:
         """What computes the history."""
-        return LatticeObservables(system)
+        return LatticeObservables(system, box)
 
     def fields(self, system: LatticeScheme, state: LatticeState, u: Floats, collector: Collector) -> Fields:
         """See `setup.Setup`."""
         return Fields(*(collector.blocks(values) for values in nodal(system, u)))
+
+    def order_parameter(self, system: LatticeScheme, state: LatticeState, u: Floats, particle: int) -> Floats:
+        """See `setup.Setup`."""
+        return order_parameter(system, u, particle)
 
     def remarks(self) -> list[str]:
         """See `setup.Setup`."""
@@ -98,19 +111,20 @@ class LatticeSetup:
         self, directory: Path, system: LatticeScheme, state: LatticeState, collector: Collector, notes: dict[str, Any]
     ) -> None:
         """Write the checkpoint."""
-        g, boxes = system.lattice, system.boxes
-        mine = windows.lay_out(boxes, g.nodes, g.reach, (g.owned.start, g.owned.stop), range(0))
-        part = np.zeros(int(mine.offset[-1]))
-        windows.carry(part, mine, state.y, system.layout)
-        parts = self.ranks.to_root((part, mine))
-        if parts is None:
-            return
-        layout = whole(g, boxes)
-        y = np.zeros(int(layout.offset[-1]))
-        for theirs, of in parts:
-            windows.carry(y, layout, theirs, of)
-        fields = {"y": y, "motion": system.carried, **{f"window_{name}": getattr(boxes, name) for name in BOXES}}
-        checkpoint.store(directory, fields, state, self.nodes, self.fingerprint(), notes)
+        g, boxes, layout = system.lattice, system.boxes, system.layout
+
+        def parts() -> Iterator[tuple[int, Array]]:
+            for slab in slabs_of(g, layout, boxes, g.owned):
+                yield slab.there.start, state.y[slab.here]
+
+        size = int(whole(g, boxes)[2][-1])
+        fields = {
+            "y": checkpoint.Spread((size,), state.y.dtype, parts),
+            "motion": system.carried,
+            **{f"window_{name}": getattr(boxes, name) for name in BOXES},
+        }
+        head = checkpoint.Head(state, self.nodes, self.fingerprint(), notes)
+        checkpoint.store(directory, self.ranks, fields, head)
 
     def read(self, directory: Path, identity: str) -> Kept:
         """See `setup.Setup`."""
@@ -118,9 +132,9 @@ class LatticeSetup:
         return found
 
     def _read(self, directory: Path, identity: str) -> Kept:
-        values, counts, notes = checkpoint.load(directory, identity, self.nodes, self.fingerprint())
+        values, counts, notes = checkpoint.load(directory, identity, self.nodes, self.fingerprint(), ("y",))
         boxes = Boxes(**{name: values[f"window_{name}"] for name in BOXES})
-        return Kept(values["y"], boxes, counts, notes["memory"], values["motion"], notes["wall_time"])
+        return Kept(directory, boxes, counts, notes["memory"], values["motion"], notes["wall_time"])
 
     def fingerprint(self) -> str:
         """Of what the fields stand on."""
@@ -131,6 +145,29 @@ class LatticeSetup:
 BOXES = ("low", "size", "row", "begin", "end")
 
 
-def whole(lattice: Lattice, boxes: Boxes) -> Layout:
-    """The layout of the windows as if one rank had all of them."""
-    return windows.lay_out(boxes, lattice.nodes, lattice.reach, (0, lattice.nodes[0]), range(0))
+class Slab(NamedTuple):
+    """Some planes of a window: their places in the vector of one rank that would have all, and in this rank's."""
+
+    there: slice
+    here: slice
+
+
+def slabs_of(lattice: Lattice, layout: Layout, boxes: Boxes, planes: range) -> Iterator[Slab]:
+    """What of each window is on some planes of nodes that this rank holds."""
+    low, plane, offset = whole(lattice, boxes)
+    for w in range(len(low)):
+        begin = max(planes.start, low[w])
+        end = min(planes.stop, low[w] + (offset[w + 1] - offset[w]) // max(plane[w], 1))
+        if begin < end:
+            there = int(offset[w] + (begin - low[w]) * plane[w])
+            here = int(layout.offset[w] + (begin - layout.low[w, 0]) * plane[w])
+            size = int((end - begin) * plane[w])
+            yield Slab(slice(there, there + size), slice(here, here + size))
+
+
+def whole(lattice: Lattice, boxes: Boxes) -> tuple[Integers, Integers, Integers]:
+    """The windows as if one rank had all of them, rho's first: first plane, values of a plane, (w + 1,) offsets."""
+    low = np.append(0, boxes.low[:, 0])
+    plane = np.append(lattice.nodes[1] * lattice.row, boxes.size[:, 1] * boxes.size[:, 2])
+    planes = np.append(lattice.nodes[0], boxes.size[:, 0])
+    return low, plane, np.append(0, np.cumsum(plane * planes))

@@ -1,5 +1,6 @@
 """Meshes: the lattices against crystallography and topology, files and gmsh against what went into them."""
 
+import signal
 import threading
 from itertools import combinations
 from pathlib import Path
@@ -20,6 +21,7 @@ from frit.solver.geometry import (
     gmsh_mesh,
     lattice,
     make_mesh,
+    started,
 )
 
 INSTALL = "apt-get install libglu1-mesa libgl1 libxrender1 libxcursor1 libxft2 libxinerama1 libgomp1"
@@ -306,26 +308,33 @@ def test_gmsh_fills_the_box_the_same_way_every_time(
 
 
 def test_a_file_that_gmsh_wrote_with_all_its_entities(gmsh: Any, tmp_path: Path) -> None:
-    gmsh.initialize(readConfigFiles=False, interruptible=False)
-    try:
+    with started(gmsh):
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.model.occ.addBox(0, 0, 0, 2, 1, 1)
         gmsh.model.occ.synchronize()
         gmsh.model.mesh.generate(3)
         gmsh.write(str(tmp_path / "box.msh"))
-    finally:
-        gmsh.finalize()
     check_mesh(file_mesh(tmp_path / "box.msh", (2.0, 1.0, 1.0)), (2.0, 1.0, 1.0), wall=1e-12)
 
 
 def test_gmsh_in_use_elsewhere_is_left_alone(gmsh: Any) -> None:
-    gmsh.initialize(readConfigFiles=False, interruptible=False)
-    try:
+    with started(gmsh):
         with pytest.raises(MeshError, match=r"gmsh\.finalize"):
             gmsh_mesh((3.0, 3.0), 1.0)
         assert gmsh.isInitialized()
-    finally:
-        gmsh.finalize()
+
+
+def test_gmsh_does_not_have_the_process_killed_by_a_broken_pipe(gmsh: Any) -> None:
+    """Python ignores SIGPIPE and raises; a service or a notebook that made a mesh must still do so."""
+
+    def ignored() -> int:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1], 16) for line in lines if line.startswith("SigIgn"))
+
+    before = ignored()
+    assert before >> (signal.SIGPIPE - 1) & 1
+    gmsh_mesh((3.0, 3.0), 1.0)
+    assert ignored() == before
 
 
 @pytest.mark.parametrize(

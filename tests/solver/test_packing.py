@@ -277,14 +277,14 @@ def test_equal_discs_pack_at_random_and_crystallise_when_poured() -> None:
 def test_wider_spreads_pack_denser() -> None:
     """Random close packing rises by some 0.02 for a spread of 0.4 means (Desmond & Weeks 2014).
 
-    The scatter of one heap is 0.003 and that of a mean of four half of it: a rise of 0.005 is beyond chance.
+    In six heaps of this size it was 0.0174, and the scatter of one heap 0.002: less than 0.01 is beyond chance.
     """
-    size = [16.0, 16.0, 30.0]
+    size = [24.0, 24.0, 30.0]
     equal, wide = (
-        np.mean([core(packed(size, count=count, std_radius=std, seed=seed), size, 4.0) for seed in range(4)])
-        for std, count in ((0.0, 700), (0.4, 480))
+        np.mean([core(packed(size, count=count, std_radius=std, seed=seed), size, 4.0) for seed in range(2)])
+        for std, count in ((0.0, 1575), (0.4, 1080))
     )
-    assert wide > equal + 0.005
+    assert wide > equal + 0.01
 
 
 @pytest.mark.slow

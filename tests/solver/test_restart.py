@@ -5,6 +5,7 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -101,6 +102,24 @@ def test_another_number_of_ranks_goes_on(tmp_path: Path, whole: dict[str, Path],
     directory = resume(interrupted(PAIR, tmp_path / "run", before), after)
     assert record(directory)["ranks"] == after
     assert different(whole["rk2"], directory, 1e-10) == {}
+
+
+@pytest.mark.parametrize("name", ["adaptive", "adaptive on a mesh"])
+def test_a_checkpoint_is_the_same_whoever_writes_it(tmp_path: Path, whole: dict[str, Path], name: str) -> None:
+    """Bit by bit: three ranks each read their part of a finished run, and write it again."""
+
+    def content() -> dict[str, Any]:
+        with h5py.File(directory / "checkpoint.h5") as file:
+            fields = {name: (str(field.dtype), field.shape, field[...].tobytes()) for name, field in file.items()}
+            return fields | {name: value for name, value in file.attrs.items() if name != "notes"}
+
+    directory = tmp_path / "run"
+    shutil.copytree(whole[name], directory)
+    written = (directory / "checkpoint.h5").stat().st_mtime_ns
+    before = content()
+    resume(directory, ranks=3)
+    assert content() == before
+    assert (directory / "checkpoint.h5").stat().st_mtime_ns > written
 
 
 def test_usr1_writes_a_checkpoint_and_the_run_goes_on(tmp_path: Path, whole: dict[str, Path]) -> None:

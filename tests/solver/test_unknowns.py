@@ -73,6 +73,7 @@ def test_strips_have_one_field_one_particle_and_one_kind(layout: Layout) -> None
         assert (np.diff(column[part] * NODES + node[part]) > 0).all()
     for (rank, common), (same, entries) in zip(layout.halo.neighbours, places.halo.neighbours, strict=True):
         assert rank == same
+        assert isinstance(common, np.ndarray)
         np.testing.assert_array_equal(entries, np.flatnonzero(np.isin(node, common)))
 
 

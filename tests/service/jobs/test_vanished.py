@@ -75,7 +75,7 @@ async def is_lost_for_good(engine: Engine, job: Job, runner: int) -> None:
     assert (job.state, job.message, job.attempt, job.retrying) == (State.LOST, REASON, 1, False)
     assert not lives(runner)
     assert not of_data(engine.settings.data)
-    assert engine.scheduler.backend.free == 1
+    await until(engine, lambda: engine.scheduler.backend.free == 1)
     (after,) = await ended(engine, *await submit(engine, new_job("sleep 0", 0.2)))
     assert after.state is State.SUCCEEDED
     assert engine.trouble() is None

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .arrays import Floats, Integers, Numbers
-from .jit import jit
+from .jit import ONE, ZERO, jit
 
 DEPTH = 16  # of the stack: at most 6 cuts, each replaces the simplex on top by at most 3: 1 + 6 * 2 = 13
 
@@ -46,7 +46,7 @@ def clip(
         for corner in range(dim + 1):
             for i in range(dim):
                 stack[0, corner, i] = nodes[cells[p, corner], i]
-        done[0], top = 2 * dim if inside(nodes, cells[p], bounds) else 0, 0
+        done[0], top = 2 * dim if inside(nodes, cells[p], bounds) else 0, ZERO
         while top >= 0:
             if done[top] < 2 * dim:
                 kept = arrange(x, distance, stack[top], done[top], bounds)
@@ -121,16 +121,16 @@ def replace(
         return top if kept else top - 1
     if kept == 1:  # corner 0 and the sections of its edges
         for out in range(dim + 1):
-            section(stack, top, out, x, distance, 0, out)
+            section(stack, top, out, x, distance, ZERO, out)
         return top
     # Otherwise a prism between two simplices p and q of dim corners: kept corners and sections of edges.
     for i in range(dim):
         if kept == dim:
-            section(prism, 0, i, x, distance, i, i)
-            section(prism, 1, i, x, distance, i, dim)
+            section(prism, ZERO, i, x, distance, i, i)
+            section(prism, ONE, i, x, distance, i, dim)
         else:
-            section(prism, 0, i, x, distance, 0, i + 1 if i else 0)
-            section(prism, 1, i, x, distance, 1, i + 1)
+            section(prism, ZERO, i, x, distance, ZERO, i + 1 if i else 0)
+            section(prism, ONE, i, x, distance, ONE, i + 1)
     # It consists of the simplices (p_0 ... p_k, q_k ... q_(dim - 1)), k = 0 ... dim - 1.
     for k in range(dim):
         done[top + k] = done[top]

@@ -10,14 +10,11 @@ Loops go entry by entry: an operation on whole arrays costs numba a second of co
 """
 
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 
 from .arrays import Floats, Integers
-from .jit import inlined, jit
-
-FIRST = cast(int, np.int64(0))  # a literal 0 would be a type of its own, and everything below it compiled once more
+from .jit import ZERO, inlined, jit
 
 
 @dataclass(frozen=True)
@@ -208,7 +205,7 @@ def eliminate(
                 for c in range(k):
                     work[0, r, c] = lower[e, r, c]
                     lower[e, r, c] = 0.0
-            add_product(lower, e, work, FIRST, diagonal, pivots[i], 1.0)
+            add_product(lower, e, work, ZERO, diagonal, pivots[i], 1.0)
         for d in range(first[i], first[i + 1]):
             add_product(diagonal, later[d], lower, d, upper, d, -1.0)
             for e in range(d + 1, first[i + 1]):

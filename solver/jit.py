@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 COMPILED = (
     "simd.py", "energy.py", "kernels.py", "blocks.py", "block_kernels.py", "neighbours.py", "shape.py", "clip.py",
@@ -92,6 +93,9 @@ def seed(folder: Path) -> None:
 numba.config.CACHE_DIR = str(trusted_folder())  # type: ignore[attr-defined]  # numba makes its settings at import
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+# For arguments of compiled functions: each is compiled once more for a literal 0.
+ZERO, ONE = cast(int, np.int64(0)), cast(int, np.int64(1))
+
 EXACT: dict[str, Any] = {"cache": True, "error_model": "numpy"}
 OPTIONS: dict[str, Any] = EXACT | {"fastmath": FASTMATH}
 

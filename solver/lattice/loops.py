@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import Floats, Integers
 from ..contacts import FAR, Contacts, add_contact
 from ..energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
-from ..jit import lean, lean_jit
+from ..jit import ZERO, lean, lean_jit
 from ..simd import (
     LANES,
     Pack,
@@ -35,8 +35,7 @@ from .windows import Layout
 
 PAD = 24  # places on both sides of a row of work space
 SIX = 6  # taps of the default functions: loops of that length are unrolled
-RHO = cast(int, np.int32(0))  # rho's window, of the type that others have: a literal 0 would be compiled once more
-ZERO = cast(int, np.int64(0))  # likewise
+RHO = cast(int, np.int32(0))  # the number of rho's window, of the type that others have, see `jit.ZERO`
 
 
 class Tables(NamedTuple):

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -241,12 +242,14 @@ def test_runners_outlive_the_service_and_are_adopted(tmp_path: Path, how: signal
         directories = [data / "runs" / job.id for job in jobs]
         while not all((directory / "calls").exists() for directory in directories):
             assert process.poll() is None
+            time.sleep(0.01)
         process.send_signal(how)
         process.wait()
     pid = int(read_json(directories[0] / "attempt.json")["pid"])
     assert psutil.pid_exists(pid)
     while not (directories[1] / "exit.json").exists():
         assert psutil.pid_exists(pid)
+        time.sleep(0.01)
     asyncio.run(after(jobs, pid))
 
 

@@ -5,6 +5,8 @@ the fewest comes next (minimum degree); which pairs that adds is found once for 
 exchanged inside a particle's own block alone: where contacts push back, eigenvalues are at least 1 and need no more (a
 digit is lost in one of a thousand random systems of that kind).
 Where a block has no inverse the solution is not finite, and the integrator tries a shorter step, with a smaller tau.
+
+Loops go entry by entry: an operation on whole arrays costs numba a second of compiling, for a message about shapes.
 """
 
 from dataclasses import dataclass
@@ -13,6 +15,8 @@ import numpy as np
 
 from .arrays import Floats, Integers
 from .jit import inlined, jit
+
+FIRST = np.int64(0)  # a literal 0 would be a type of its own, and everything below it compiled once more
 
 
 @dataclass(frozen=True)
@@ -65,30 +69,40 @@ def order(pairs: Integers, particles: int) -> tuple[Integers, Integers, Integers
 
     Each is the one coupled to the fewest that are left, the first of them; those it leaves are then coupled.
     """
-    degree = np.zeros(particles, dtype=np.int64)
-    for a in pairs.ravel():
-        degree[a] += 1
-    start = np.cumsum(degree) - degree
-    lists = np.empty(4 * pairs.size, dtype=np.int64)  # of the partners of a: lists[start[a]] ...; grows at its end
-    end = start.copy()
-    for a, b in pairs:
+    waiting = np.zeros(particles, dtype=np.int64)  # the number of partners; more than any of those that are gone
+    for p in range(pairs.shape[0]):
+        waiting[pairs[p, 0]] += 1
+        waiting[pairs[p, 1]] += 1
+    start = np.empty(particles, dtype=np.int64)
+    end = np.empty(particles, dtype=np.int64)
+    used = 0
+    for a in range(particles):
+        start[a] = end[a] = used
+        used += waiting[a]
+    lists = np.empty(2 * used, dtype=np.int64)  # of the partners of a: lists[start[a]] ...; grows at its end
+    for p in range(pairs.shape[0]):
+        a, b = pairs[p, 0], pairs[p, 1]
         lists[end[a]], lists[end[b]] = b, a
         end[a] += 1
         end[b] += 1
-    used = pairs.size
-    waiting = degree.copy()  # the number of partners; more than any of those that are gone
     mark = np.zeros(particles, dtype=np.int64)
     joins = 0
     pivots = np.empty(particles, dtype=np.int64)
     for i in range(particles):
-        a = np.argmin(waiting)
+        a = 0
+        for b in range(particles):
+            if waiting[b] < waiting[a]:
+                a = b
         pivots[i] = a
         waiting[a] = particles
         for k in range(start[a], end[a]):
             b = lists[k]
             most = end[b] - start[b] + end[a] - start[a]
             if used + most > lists.size:
-                lists = np.concatenate((lists[:used], np.empty(used + most, dtype=np.int64)))
+                longer = np.empty(2 * used + most, dtype=np.int64)
+                for j in range(used):
+                    longer[j] = lists[j]
+                lists = longer
             begin = used
             joins += 1
             mark[a] = mark[b] = joins
@@ -103,12 +117,17 @@ def order(pairs: Integers, particles: int) -> tuple[Integers, Integers, Integers
                     used += 1
             start[b], end[b] = begin, used
             waiting[b] = used - begin
-    counts = (end - start)[pivots]
-    partners = np.empty(counts.sum(), dtype=np.int64)
+    counts = np.empty(particles, dtype=np.int64)
+    whole = 0
+    for i in range(particles):
+        counts[i] = end[pivots[i]] - start[pivots[i]]
+        whole += counts[i]
+    partners = np.empty(whole, dtype=np.int64)
     e = 0
-    for a in pivots:
-        partners[e : e + end[a] - start[a]] = lists[start[a] : end[a]]
-        e += end[a] - start[a]
+    for i in range(particles):
+        for j in range(start[pivots[i]], end[pivots[i]]):
+            partners[e] = lists[j]
+            e += 1
     return pivots, counts, partners
 
 
@@ -158,19 +177,18 @@ def gather(
     diagonal: Floats, upper: Floats, lower: Floats, blocks: Floats, pairs: Integers, place: Integers, later: Integers
 ) -> None:
     """Add the blocks to the matrix."""
-    count = pairs.shape[0]
+    count, k = pairs.shape[0], diagonal.shape[1]
     for p in range(count):
         a = pairs[p, 0]
         b = pairs[p, 1]
         e = place[p]
-        diagonal[a] += blocks[p]
-        diagonal[b] += blocks[3 * count + p]
-        if later[e] == b:
-            upper[e] += blocks[count + p]
-            lower[e] += blocks[2 * count + p]
-        else:
-            upper[e] += blocks[2 * count + p]
-            lower[e] += blocks[count + p]
+        ab, ba = (count + p, 2 * count + p) if later[e] == b else (2 * count + p, count + p)
+        for r in range(k):
+            for c in range(k):
+                diagonal[a, r, c] += blocks[p, r, c]
+                diagonal[b, r, c] += blocks[3 * count + p, r, c]
+                upper[e, r, c] += blocks[ab, r, c]
+                lower[e, r, c] += blocks[ba, r, c]
 
 
 @jit
@@ -179,14 +197,17 @@ def eliminate(
     pivots: Integers, first: Integers, later: Integers, target: Integers,
 ) -> None:
     """Turn the matrix into its factors, in place."""
-    work = np.empty((1, diagonal.shape[1], diagonal.shape[1]))
+    k = diagonal.shape[1]
+    work = np.empty((1, k, k))
     t = 0
     for i in range(pivots.size):
         invert(diagonal[pivots[i]], work[0])
         for e in range(first[i], first[i + 1]):
-            work[0] = lower[e]
-            lower[e] = 0.0
-            add_product(lower, e, work, 0, diagonal, pivots[i], 1.0)
+            for r in range(k):
+                for c in range(k):
+                    work[0, r, c] = lower[e, r, c]
+                    lower[e, r, c] = 0.0
+            add_product(lower, e, work, FIRST, diagonal, pivots[i], 1.0)
         for d in range(first[i], first[i + 1]):
             add_product(diagonal, later[d], lower, d, upper, d, -1.0)
             for e in range(d + 1, first[i + 1]):
@@ -208,7 +229,8 @@ def substitute(
                 for c in range(k):
                     x[later[e], r] -= lower[e, r, c] * x[pivots[i], c]
     for i in range(pivots.size - 1, -1, -1):
-        right[:] = x[pivots[i]]
+        for r in range(k):
+            right[r] = x[pivots[i], r]
         for e in range(first[i], first[i + 1]):
             for r in range(k):
                 for c in range(k):
@@ -243,10 +265,10 @@ def multiply(result: Floats, r: int, a: Floats, p: int, b: Floats, q: int, facto
 def invert(block: Floats, work: Floats) -> None:
     """Replace a block (k, k) by its inverse, by Gauss and Jordan with row exchange; not finite where it has none."""
     k = block.shape[0]
-    work[:] = block
-    block[:] = 0.0
     for r in range(k):
-        block[r, r] = 1.0
+        for c in range(k):
+            work[r, c] = block[r, c]
+            block[r, c] = 1.0 if r == c else 0.0
     for s in range(k):
         best = s
         for r in range(s + 1, k):

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from . import amounts, vectors
-from .arrays import Floats
+from .arrays import Floats, zeros
 from .case import Case
 from .partition import Ranks
 from .system import Progress, System
@@ -80,7 +80,7 @@ class RK2:
     def restart(self, system: System, state: Progress) -> None:
         """Go on from the state's fields."""
         self.y = system.vector(state)
-        self.rate = np.empty_like(self.y)
+        self.rate = zeros(self.y.size)
 
     @property
     def memory(self) -> dict[str, float]:
@@ -140,7 +140,7 @@ class Chebyshev:
         self.y = self.old = self.rate_0 = self.rate_1 = np.empty(0)  # gives their memory back before more is taken
         self.work = []
         self.y = system.vector(state)
-        self.old, self.rate_0, self.rate_1, *self.work = (np.zeros_like(self.y) for _ in range(5))
+        self.old, self.rate_0, self.rate_1, *self.work = (zeros(self.y.size) for _ in range(5))
         self.fresh = False
 
     def step(self, system: System, state: Progress, limit: float) -> None:

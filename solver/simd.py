@@ -2,9 +2,9 @@
 
 numba has no vector type, and its optimiser does not find the one that frit's layout is made for: rho and seven order
 parameters of a node are eight neighbouring doubles. A pack maps to LLVM's `<8 x double>`: one AVX-512 register, or two
-AVX2 registers on older processors. Inside `@jit` functions `load`, `store` and `splat` move packs, + - * work on them
-and with floats, so that a formula written for a float also serves a pack, and `total`, `first`, `with_first`,
-`positive` and `transpose` do what their names say.
+AVX2 registers on older processors. Inside `@jit` functions `load`, `store` and `splat` move packs (`get` and `put` by
+the address that `place` tells), + - * work on them and with floats, so that a formula written for a float also serves
+a pack, and `from_lane`, `total`, `first`, `with_first`, `positive` and `transpose` do what their names say.
 
 Far from all particles fields fall below 1e-308, where processors calculate a hundred times slower: between
 `flush_denormals` and `restore_denormals` such numbers are 0.
@@ -86,6 +86,68 @@ def _store(typing: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp, pack), generate
+
+
+@intrinsic
+def _place(typing: Any, array: Any, row: Any, column: Any) -> Any:
+    """place(array, row, column): the address of array[row, column]; good while the array lives."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ptrtoint(_address(context, builder, signature.args[0], *arguments), ir.IntType(64))
+
+    return types.intp(array, types.intp, types.intp), generate
+
+
+@intrinsic
+def _get(typing: Any, address: Any) -> Any:
+    """get(address): the pack that begins there."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        result = builder.load(builder.inttoptr(arguments[0], VECTOR.as_pointer()))
+        result.align = 8
+        return result
+
+    return pack(types.intp), generate
+
+
+@intrinsic
+def _put(typing: Any, address: Any, value: Any) -> Any:
+    """put(address, pack): write it there."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.store(arguments[1], builder.inttoptr(arguments[0], VECTOR.as_pointer())).align = 8
+        return context.get_dummy_value()
+
+    return types.void(types.intp, pack), generate
+
+
+@intrinsic
+def _fetch(typing: Any, address: Any) -> Any:
+    """fetch(address): bring the line of that address near, for later."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer, kind = ir.IntType(8).as_pointer(), ir.IntType(32)
+        function = builder.module.declare_intrinsic(
+            "llvm.prefetch", (pointer,), ir.FunctionType(ir.VoidType(), [pointer, kind, kind, kind])
+        )
+        reading, soon, data = 0, 2, 1
+        flags = [ir.Constant(kind, flag) for flag in (reading, soon, data)]
+        builder.call(function, [builder.inttoptr(arguments[0], pointer), *flags])
+        return context.get_dummy_value()
+
+    return types.void(types.intp), generate
+
+
+@intrinsic(prefer_literal=True)
+def _from_lane(typing: Any, first: Any, second: Any, lane: Any) -> Any:
+    """from_lane(a, b, n): lanes n ... LANES - 1 of a, and after them the first n of b; n is written as a number."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        n = signature.args[2].literal_value
+        chosen = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [n + k for k in range(LANES)])
+        return builder.shuffle_vector(arguments[0], arguments[1], chosen)
+
+    return (pack(pack, pack, lane), generate) if isinstance(lane, types.IntegerLiteral) else None
 
 
 @intrinsic
@@ -241,6 +303,11 @@ class Pack(Protocol):
 # To a type checker an intrinsic is what it is in Python, where a call raises; to kernels it is a function.
 load = cast(Callable[[Floats, int, int], Pack], _load)
 store = cast(Callable[[Floats, int, int, Pack], None], _store)
+place = cast(Callable[[Floats, int, int], int], _place)
+get = cast(Callable[[int], Pack], _get)
+fetch = cast(Callable[[int], None], _fetch)
+put = cast(Callable[[int, Pack], None], _put)
+from_lane = cast(Callable[[Pack, Pack, int], Pack], _from_lane)
 splat = cast(Callable[[float], Pack], _splat)
 first = cast(Callable[[Pack], float], _first)
 with_first = cast(Callable[[Pack, float], Pack], _with_first)

@@ -14,6 +14,7 @@ from ..shape import CONVERGED, NEWTON_STEPS, ShapeError
 from ..simd import LANES
 
 QUARTERS = (0.25, 0.75)  # of a cell, where its points are
+SOME = 3  # reaches are whole multiples of it: loops take the taps of both sides six at a time
 GHOSTS = 24  # places beyond both ends in tables by cell or node: packs may begin there
 
 
@@ -95,6 +96,7 @@ def make_axis(length: float, spacing: float, gamma: float, tolerance: float, wid
     reach = 1 + max(0, int(np.floor(search_range(gamma, tolerance) - QUARTERS[0])))
     if reach > LANES:
         raise ShapeError(f"gamma = {gamma:g} and tolerance = {tolerance:g}: functions reach {reach} nodes far")
+    reach = SOME * -(-reach // SOME)
     nodes = np.linspace(0.0, length, cells + 1)
     points = (np.arange(cells)[None, :] + np.array(QUARTERS)[:, None]) * step
     N, dN = functions(points.ravel(), nodes, step, gamma, tolerance)

@@ -17,7 +17,6 @@ from ..run import (
     renew,
 )
 from . import loops, windows
-from .axis import GHOSTS
 from .scheme import LatticeScheme, LatticeState
 from .start import fitting_boxes, move
 
@@ -74,7 +73,7 @@ def extremes(scheme: LatticeScheme) -> Floats:
     g, found = scheme.lattice, np.array([np.inf, -np.inf, -np.inf, 0.0])
     edges = np.array([g.layers.start == 0, g.layers.stop == g.axes[0].cells], dtype=float)
     cells = 1 if g.axes[1] is None else g.axes[1].cells
-    loops.extremes(found, scheme.points.rho, len(g.layers), cells, g.axes[2].cells, edges)
+    loops.extremes(found, scheme.points.rho, len(g.layers), cells, g.column, g.axes[2].cells, edges)
     return found
 
 
@@ -84,7 +83,7 @@ def place_of(scheme: LatticeScheme, value: float, found: Floats) -> str:
     said = None
     if value in (found[1], found[2]):
         slow, middle, fast = g.axes
-        rows = scheme.points.rho[:, GHOSTS : GHOSTS + fast.cells]
+        rows = scheme.points.rho[:, g.column : g.column + fast.cells]
         row, c = divmod(int((rows == value).argmax()), fast.cells)
         p, k, j = (int(i) for i in np.unravel_index(row, (2, len(g.layers), 1 if middle is None else middle.cells)))
         between = [] if middle is None else [middle.points[p, j]]

@@ -6,7 +6,7 @@ the reverse order. Each of the two points per cell has sums of its own, p = 0 or
 planes of nodes; what is kept of it fits into the cache.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -14,12 +14,28 @@ from ..arrays import Floats, Integers
 from ..contacts import FAR, Contacts, add_contact
 from ..energy import Coefficients, df_deta, df_drho, free_energy_density, mobility
 from ..jit import lean, lean_jit
-from ..simd import LANES, Pack, flush_denormals, load, positive, restore_denormals, splat, store, total
+from ..simd import (
+    LANES,
+    Pack,
+    fetch,
+    flush_denormals,
+    from_lane,
+    get,
+    load,
+    place,
+    positive,
+    put,
+    restore_denormals,
+    splat,
+    store,
+    total,
+)
 from .axis import GHOSTS as GHOSTS
 from .windows import Layout
 
 PAD = 24  # places on both sides of a row of work space
 SIX = 6  # taps of the default functions: loops of that length are unrolled
+RHO = cast(int, np.int32(0))  # rho's window, of the type that others have: a literal 0 would be compiled once more
 
 
 class Tables(NamedTuple):
@@ -33,9 +49,9 @@ class Tables(NamedTuple):
     d_fast: Floats
     fast_back: Floats  # (2 taps, nodes + ghosts) by node
     d_fast_back: Floats
-    inner: Floats  # (2, taps) N along the fast axis far from walls
+    inner: Floats  # (2, 1, taps) N along the fast axis far from walls
     d_inner: Floats
-    x: Floats  # (2, cells + ghosts) position of the points along the fast axis, from the domain's centre
+    x: Floats  # (2, cells + ghosts) position of the points along the fast axis, from the domain's centre; see `column`
     y: Floats  # (2, cells) along the middle axis
     z: Floats  # (2, cells) along the slow axis
     weight: float  # w_p, nm^dim
@@ -46,9 +62,10 @@ class Room(NamedTuple):
 
     Z: Floats  # (4 rows, width) sums along the slow axis: N and dN of point 0, of point 1
     Q: Floats  # (4 rows, width) what goes back along the slow axis
-    Y: Floats  # (6, width) sums along the middle axis, p by p: value, derivatives along the middle and the slow axis
-    F: Floats  # (8, width) of a row of points, p by p: source and flux along fast, middle, slow axis
-    spans: Integers  # (rows, 2) packs of each row that hold anything
+    Y: Floats  # (3, width) sums along the middle axis: value, derivatives along the middle and the slow axis
+    F: Floats  # (4, width) of a row of points: source and flux along fast, middle, slow axis
+    nothing: Floats  # (1, width) zeros, in the place of rows that a window does not have
+    waste: Floats  # (1, width) what goes back to such rows
     sums: Floats  # (8 cells, P) S1, sum_(b != a) eta_a eta_b, S2, S3 of points 0 and of points 1
     swept: Floats  # (6 cells, P) v_adv along fast, middle, slow axis
     fields: Floats  # (12, 1) of one contact
@@ -64,167 +81,228 @@ class Points(NamedTuple):
     D: Floats
 
 
+class Rows(NamedTuple):
+    """Addresses of a row's place 0: of what is summed along the fast axis for values and derivatives."""
+
+    value: int
+    middle: int
+    slow: int
+
+
+Six = tuple[Pack, Pack, Pack, Pack, Pack, Pack]  # functions in registers
+BYTES = 8  # of a number
+PACK = BYTES * LANES
+
+
 @lean
-def along_slow(slopes: bool, Z: Floats, spans: Integers, y: Floats, w: int, k: int, L: Layout, T: Tables) -> None:
+def six(table: Floats, p: int, k: int, t: int) -> Six:
+    """The functions of taps t ... t + 5, each in every lane."""
+    return (
+        splat(table[p, k, t]), splat(table[p, k, t + 1]), splat(table[p, k, t + 2]),
+        splat(table[p, k, t + 3]), splat(table[p, k, t + 4]), splat(table[p, k, t + 5]),
+    )  # fmt: skip
+
+
+@lean
+def dot(N: Six, u: Six) -> Pack:
+    """The sum over six taps."""
+    return N[0] * u[0] + N[1] * u[1] + N[2] * u[2] + N[3] * u[3] + N[4] * u[4] + N[5] * u[5]
+
+
+@lean
+def plane(array: Floats, w: int, s: int, L: Layout, instead: Floats) -> tuple[int, int]:
+    """Where the window's plane s begins, and the bytes from row to row; without such a plane the row `instead`."""
+    if 0 <= s < L.size[w, 0]:
+        return place(array, 0, L.offset[w] + s * L.size[w, 1] * L.size[w, 2]), BYTES * L.size[w, 2]
+    return place(instead, 0, PAD), 0
+
+
+@lean
+def row_of(array: Floats, f: int, r: int, nm: int, instead: Floats) -> int:
+    """Where row r of the f-th of four arrays begins; without such a row `instead`."""
+    return place(array, f * (array.shape[0] // 4) + r, PAD) if 0 <= r < nm else place(instead, 0, PAD)
+
+
+@lean
+def along_slow(slopes: bool, y: Floats, w: int, k: int, L: Layout, T: Tables, room: Room) -> tuple[int, int]:
     """Z = sum_t N_t u of the planes that layer k sees, for both points; with dN, too, where slopes are wanted.
 
-    spans become the packs of each row in which a node of these planes is in the window; elsewhere Z is 0.
+    Z is 0 beside a row's span, as far as any other's reaches, which is returned.
     """
-    ns, nm, nf = L.size[w, 0], L.size[w, 1], L.size[w, 2]
+    Z, spans = room.Z, L.spans
+    rows = Z.shape[0] // 4
+    nm = L.size[w, 1]
     taps = T.slow.shape[2]
     first = k - taps // 2 + 1 - L.low[w, 0]
-    t0, t1 = max(0, -first), min(taps, ns - first)
+    seen = L.span[w] + (k - L.layer[w]) * nm
+    B, E = L.size[w, 2] // LANES, 0
     for r in range(nm):
-        begin, end = nf, 0
-        for t in range(t0, t1):
-            row = L.row[w] + (first + t) * nm + r
-            if L.end[row] > L.begin[row]:
-                begin, end = min(begin, L.begin[row]), max(end, L.end[row])
-        b = begin // LANES
-        e = max(-(-end // LANES), b)
-        spans[r, 0] = b
-        spans[r, 1] = e
-        at = L.offset[w] + ((first + t0) * nm + r) * nf
-        if t1 - t0 == SIX:
-            for q in range(b, e):
-                sum_slow(slopes, Z, y, at, nm * nf, r, q, k, t0, SIX, T)
-        else:
-            for q in range(b, e):
-                sum_slow(slopes, Z, y, at, nm * nf, r, q, k, t0, t1 - t0, T)
-        for q in range(0, b):
-            clear_pack(Z, r, q)
-        for q in range(e, nf // LANES):
-            clear_pack(Z, r, q)
+        if spans[seen + r, 1] > spans[seen + r, 0]:
+            B, E = min(B, int(spans[seen + r, 0])), max(E, int(spans[seen + r, 1]))
+    for t in range(0, taps, SIX):
+        at0, step0 = plane(y, w, first + t, L, room.nothing)
+        at1, step1 = plane(y, w, first + t + 1, L, room.nothing)
+        at2, step2 = plane(y, w, first + t + 2, L, room.nothing)
+        at3, step3 = plane(y, w, first + t + 3, L, room.nothing)
+        at4, step4 = plane(y, w, first + t + 4, L, room.nothing)
+        at5, step5 = plane(y, w, first + t + 5, L, room.nothing)
+        N, M = six(T.slow, 0, k, t), six(T.slow, 1, k, t)
+        dN, dM = six(T.d_slow, 0, k, t), six(T.d_slow, 1, k, t)
+        for r in range(nm):
+            to0, to1 = place(Z, r, PAD), place(Z, rows + r, PAD)
+            to2, to3 = place(Z, 2 * rows + r, PAD), place(Z, 3 * rows + r, PAD)
+            for o in range(PACK * spans[seen + r, 0], PACK * spans[seen + r, 1], PACK):
+                u = (
+                    get(at0 + r * step0 + o), get(at1 + r * step1 + o), get(at2 + r * step2 + o),
+                    get(at3 + r * step3 + o), get(at4 + r * step4 + o), get(at5 + r * step5 + o),
+                )  # fmt: skip
+                fetch(at5 + (r + 2) * step5 + o)
+                keep(to0 + o, dot(N, u), t)
+                keep(to2 + o, dot(M, u), t)
+                if slopes:
+                    keep(to1 + o, dot(dN, u), t)
+                    keep(to3 + o, dot(dM, u), t)
+    for r in range(nm):
+        clear_four(Z, r, B - 2, min(spans[seen + r, 0], E + 2))
+        clear_four(Z, r, max(B - 2, spans[seen + r, 1]), E + 2)
+    return B, E
 
 
 @lean
-def sum_slow(
-    slopes: bool, Z: Floats, y: Floats, at: int, stride: int, r: int, q: int, k: int, t0: int, taps: int, T: Tables
-) -> None:
-    """One pack of `along_slow`: of taps t0 ... t0 + taps - 1, the first plane's row at y[at]."""
-    rows = Z.shape[0] // 4
-    a = splat(0.0)
-    c = splat(0.0)
-    da = splat(0.0)
-    dc = splat(0.0)
-    for t in range(taps):
-        u = load(y, 0, at + t * stride + LANES * q)
-        a = a + T.slow[0, k, t0 + t] * u
-        c = c + T.slow[1, k, t0 + t] * u
-        if slopes:
-            da = da + T.d_slow[0, k, t0 + t] * u
-            dc = dc + T.d_slow[1, k, t0 + t] * u
-    store(Z, r, PAD + LANES * q, a)
-    store(Z, 2 * rows + r, PAD + LANES * q, c)
-    if slopes:
-        store(Z, rows + r, PAD + LANES * q, da)
-        store(Z, 3 * rows + r, PAD + LANES * q, dc)
+def keep(at: int, sums: Pack, t: int) -> None:
+    """Write the sums over the first taps, add those over more."""
+    put(at, sums if t == 0 else get(at) + sums)
 
 
 @lean
-def clear_pack(Z: Floats, r: int, q: int) -> None:
-    """Set a pack of all four sums of a row to 0."""
-    rows = Z.shape[0] // 4
-    for f in range(4):
-        store(Z, f * rows + r, PAD + LANES * q, splat(0.0))
+def clear_four(array: Floats, r: int, first: int, last: int) -> None:
+    """Set packs first ... last - 1 of row r to 0 in four arrays."""
+    rows = array.shape[0] // 4
+    one, two = place(array, r, PAD), place(array, rows + r, PAD)
+    three, four = place(array, 2 * rows + r, PAD), place(array, 3 * rows + r, PAD)
+    for o in range(PACK * first, PACK * last, PACK):
+        put(one + o, splat(0.0))
+        put(two + o, splat(0.0))
+        put(three + o, splat(0.0))
+        put(four + o, splat(0.0))
 
 
 @lean
-def along_middle(
-    slopes: bool, Y: Floats, Z: Floats, spans: Integers, w: int, j: int, p: int, L: Layout, T: Tables
-) -> None:
-    """Y of the row j of cells from Z of the rows of nodes that it sees; 0 two packs beyond what they hold."""
+def along_middle(slopes: bool, w: int, k: int, j: int, p: int, L: Layout, T: Tables, room: Room) -> Rows:
+    """The sums along the middle axis for the row j of cells, of the rows of nodes that it sees.
+
+    They are 0 two packs beyond what they hold. In the plane there is no such axis, and Z is all.
+    """
+    Z, Y, nm = room.Z, room.Y, L.size[w, 1]
     taps = T.middle.shape[2]
-    first = j - (taps - 1) // 2 - L.low[w, 1]
-    t0, t1 = max(0, -first), min(taps, L.size[w, 1] - first)
-    begin, end = L.size[w, 2], 0
-    for r in range(first + t0, first + t1):
-        if spans[r, 1] > spans[r, 0]:
-            begin, end = min(begin, spans[r, 0]), max(end, spans[r, 1])
-    if t1 - t0 == SIX:
-        for q in range(begin, end):
-            sum_middle(slopes, Y, Z, first + t0, q, j, p, t0, SIX, T)
-    else:
-        for q in range(begin, end):
-            sum_middle(slopes, Y, Z, first + t0, q, j, p, t0, t1 - t0, T)
-    if end > begin:
-        for q in (begin - 2, begin - 1, end, end + 1):
-            store(Y, 3 * p, PAD + LANES * q, splat(0.0))
+    if taps == 1:
+        value = row_of(Z, 2 * p, 0, nm, room.nothing)
+        return Rows(value, value, row_of(Z, 2 * p + 1, 0, nm, room.nothing))
+    first = j - taps // 2 + 1 - L.low[w, 1]
+    cells = row_of_cells(w, k, j, L, T)
+    begin, end = int(L.cells[cells, 2]), int(L.cells[cells, 3])
+    to = Rows(place(Y, 0, PAD), place(Y, 1, PAD), place(Y, 2, PAD))
+    for t in range(0, taps, SIX):
+        r = first + t
+        a0, d0 = row_of(Z, 2 * p, r, nm, room.nothing), row_of(Z, 2 * p + 1, r, nm, room.nothing)
+        a1, d1 = row_of(Z, 2 * p, r + 1, nm, room.nothing), row_of(Z, 2 * p + 1, r + 1, nm, room.nothing)
+        a2, d2 = row_of(Z, 2 * p, r + 2, nm, room.nothing), row_of(Z, 2 * p + 1, r + 2, nm, room.nothing)
+        a3, d3 = row_of(Z, 2 * p, r + 3, nm, room.nothing), row_of(Z, 2 * p + 1, r + 3, nm, room.nothing)
+        a4, d4 = row_of(Z, 2 * p, r + 4, nm, room.nothing), row_of(Z, 2 * p + 1, r + 4, nm, room.nothing)
+        a5, d5 = row_of(Z, 2 * p, r + 5, nm, room.nothing), row_of(Z, 2 * p + 1, r + 5, nm, room.nothing)
+        N, dN = six(T.middle, p, j, t), six(T.d_middle, p, j, t)
+        for o in range(PACK * begin, PACK * end, PACK):
+            u = get(a0 + o), get(a1 + o), get(a2 + o), get(a3 + o), get(a4 + o), get(a5 + o)
+            keep(to.value + o, dot(N, u), t)
             if slopes:
-                store(Y, 3 * p + 1, PAD + LANES * q, splat(0.0))
-                store(Y, 3 * p + 2, PAD + LANES * q, splat(0.0))
+                keep(to.middle + o, dot(dN, u), t)
+                v = get(d0 + o), get(d1 + o), get(d2 + o), get(d3 + o), get(d4 + o), get(d5 + o)
+                keep(to.slow + o, dot(N, v), t)
+    for at in to:
+        clear_beside(at, begin, end)
+    return to
 
 
 @lean
-def sum_middle(
-    slopes: bool, Y: Floats, Z: Floats, r: int, q: int, j: int, p: int, t0: int, taps: int, T: Tables
-) -> None:
-    """One pack of `along_middle`: of taps t0 ... t0 + taps - 1, the first one's row r."""
-    rows = Z.shape[0] // 4
-    value = splat(0.0)
-    d_middle = splat(0.0)
-    d_slow = splat(0.0)
-    for t in range(taps):
-        u = load(Z, 2 * p * rows + r + t, PAD + LANES * q)
-        value = value + T.middle[p, j, t0 + t] * u
-        if slopes:
-            d_middle = d_middle + T.d_middle[p, j, t0 + t] * u
-            d_slow = d_slow + T.middle[p, j, t0 + t] * load(Z, (2 * p + 1) * rows + r + t, PAD + LANES * q)
-    store(Y, 3 * p, PAD + LANES * q, value)
-    if slopes:
-        store(Y, 3 * p + 1, PAD + LANES * q, d_middle)
-        store(Y, 3 * p + 2, PAD + LANES * q, d_slow)
+def clear_beside(at: int, begin: int, end: int) -> None:
+    """Set two packs on either side of packs begin ... end - 1 of a row to 0."""
+    put(at + PACK * (begin - 2), splat(0.0))
+    put(at + PACK * (begin - 1), splat(0.0))
+    put(at + PACK * end, splat(0.0))
+    put(at + PACK * (end + 1), splat(0.0))
+
+
+@lean
+def column(c: int, T: Tables) -> int:
+    """Where cell c is in rows of points: so that packs, which begin `reach` nodes before a whole one, lie in lines."""
+    return int(GHOSTS + T.fast.shape[0] // 4 + c)
 
 
 @lean
 def inner(c: int, T: Tables) -> bool:
     """Whether the eight cells from c on have six taps each and see no wall: functions are alike there."""
     cells = T.fast.shape[1] - 2 * GHOSTS
-    return T.inner.shape[1] == SIX and c >= SIX and c + LANES + SIX <= cells
+    return T.inner.shape[2] == SIX and c >= SIX and c + LANES + SIX <= cells
 
 
-@lean
-def value_at(Y: Floats, q: int, c: int, p: int, T: Tables) -> Pack:
-    """u_p of the eight cells from c on, which are places 8 q ... of Y."""
-    taps = T.fast.shape[0] // 2
-    at = PAD + LANES * q - taps // 2 + 1
+@lean_jit
+def sum_taps(u: int, step: int, N: int, row: int, taps: int) -> Pack:
+    """sum_t N_t u_t; u: the address of the first, step: the bytes to the next; N and row: likewise."""
     value = splat(0.0)
-    if inner(c, T):
-        for t in range(SIX):
-            value = value + T.inner[p, t] * load(Y, 3 * p, at + t)
-    else:
-        for t in range(taps):
-            value = value + load(T.fast, p * taps + t, GHOSTS + c) * load(Y, 3 * p, at + t)
+    for t in range(taps):
+        value = value + get(N + t * row) * get(u + t * step)
     return value
 
 
 @lean
-def all_at(Y: Floats, q: int, c: int, p: int, T: Tables) -> tuple[Pack, Pack, Pack, Pack]:
-    """u_p and its derivatives along fast, middle and slow axis."""
+def ahead(at: int) -> Six:
+    """The packs that begin 2, 1 places before the address, there, and 1, 2, 3 behind it."""
+    left, here, right = get(at - PACK), get(at), get(at + PACK)
+    return (
+        from_lane(left, here, 6), from_lane(left, here, 7), here,
+        from_lane(here, right, 1), from_lane(here, right, 2), from_lane(here, right, 3),
+    )  # fmt: skip
+
+
+@lean
+def behind(at: int) -> Six:
+    """The packs that begin 2, 1 places behind the address, there, and 1, 2, 3 before it."""
+    left, here, right = get(at - PACK), get(at), get(at + PACK)
+    return (
+        from_lane(here, right, 2), from_lane(here, right, 1), here,
+        from_lane(left, here, 7), from_lane(left, here, 6), from_lane(left, here, 5),
+    )  # fmt: skip
+
+
+@lean
+def value_at(u: int, c: int, p: int, N: Six, T: Tables) -> Pack:
+    """u_p of the eight cells from c on; u: the address of theirs, N: of the functions far from walls."""
     taps = T.fast.shape[0] // 2
-    at = PAD + LANES * q - taps // 2 + 1
-    value = splat(0.0)
-    d_fast = splat(0.0)
-    d_middle = splat(0.0)
-    d_slow = splat(0.0)
+    at = u - BYTES * (taps // 2 - 1)
     if inner(c, T):
-        for t in range(SIX):
-            u = load(Y, 3 * p, at + t)
-            value = value + T.inner[p, t] * u
-            d_fast = d_fast + T.d_inner[p, t] * u
-            d_slow = d_slow + T.inner[p, t] * load(Y, 3 * p + 2, at + t)
-        if T.middle.shape[2] > 1:
-            for t in range(SIX):
-                d_middle = d_middle + T.inner[p, t] * load(Y, 3 * p + 1, at + t)
-    else:
-        for t in range(taps):
-            N = load(T.fast, p * taps + t, GHOSTS + c)
-            u = load(Y, 3 * p, at + t)
-            value = value + N * u
-            d_fast = d_fast + load(T.d_fast, p * taps + t, GHOSTS + c) * u
-            d_middle = d_middle + N * load(Y, 3 * p + 1, at + t)
-            d_slow = d_slow + N * load(Y, 3 * p + 2, at + t)
-    return value, d_fast, d_middle, d_slow
+        return dot(N, ahead(u))
+    return sum_taps(at, BYTES, place(T.fast, p * taps, GHOSTS + c), BYTES * T.fast.shape[1], taps)
+
+
+@lean
+def all_at(u: Rows, o: int, c: int, p: int, N: Six, dN: Six, T: Tables) -> tuple[Pack, Pack, Pack, Pack]:
+    """u_p and its derivatives along fast, middle and slow axis, o bytes from the beginning of the rows."""
+    taps = T.fast.shape[0] // 2
+    first = o - BYTES * (taps // 2 - 1)
+    space = T.middle.shape[2] > 1
+    middle = splat(0.0)
+    if inner(c, T):
+        values = ahead(u.value + o)
+        if space:
+            middle = dot(N, ahead(u.middle + o))
+        return dot(N, values), dot(dN, values), middle, dot(N, ahead(u.slow + o))
+    row = BYTES * T.fast.shape[1]
+    N_c, dN_c = place(T.fast, p * taps, GHOSTS + c), place(T.d_fast, p * taps, GHOSTS + c)
+    value = sum_taps(u.value + first, BYTES, N_c, row, taps)
+    fast = sum_taps(u.value + first, BYTES, dN_c, row, taps)
+    if space:
+        middle = sum_taps(u.middle + first, BYTES, N_c, row, taps)
+    return value, fast, middle, sum_taps(u.slow + first, BYTES, N_c, row, taps)
 
 
 @lean
@@ -234,120 +312,126 @@ def add_to(array: Floats, row: int, column: int, more: Pack) -> None:
 
 
 @lean
-def cells_of(w: int, k: int, j: int, L: Layout) -> tuple[int, int]:
-    """Packs of the row j of layer k in which a cell has a corner in the window, counted as the window's places."""
-    begin, end = 1 << 30, 0
-    nm = L.size[w, 1]
-    for s in range(max(0, k - L.low[w, 0]), min(L.size[w, 0], k - L.low[w, 0] + 2)):
-        for m in range(max(0, j - L.low[w, 1]), min(nm, j - L.low[w, 1] + 2)):
-            row = L.row[w] + s * nm + m
-            begin, end = min(begin, int(L.begin[row])), max(end, int(L.end[row]))
-    return max(begin - 1, 0) // LANES, -(-end // LANES)
+def row_of_cells(w: int, k: int, j: int, L: Layout, T: Tables) -> int:
+    """Which row of `Layout.cells` the row j of layer k has."""
+    m = j - L.low[w, 1] + 1 if T.middle.shape[2] > 1 else 0
+    return int(L.cell[w] + (k - L.layer[w]) * (L.size[w, 1] + 1) + m)
 
 
 @lean
-def back(
-    Q: Floats, F: Floats, spans: Integers, w: int, j: int, p: int, b: int, e: int, L: Layout, T: Tables
-) -> None:
+def cells_of(w: int, k: int, j: int, L: Layout, T: Tables) -> tuple[int, int]:
+    """Packs of the row j of layer k in which a cell has a corner in the window, counted as the window's places."""
+    row = row_of_cells(w, k, j, L, T)
+    return int(L.cells[row, 0]), int(L.cells[row, 1])
+
+
+@lean
+def back(w: int, k: int, j: int, p: int, b: int, e: int, L: Layout, T: Tables, room: Room) -> None:
     """Q += what the row's packs b ... e - 1 of sources and fluxes give along the fast and the middle axis."""
+    Q, F, nm = room.Q, room.F, L.size[w, 1]
     taps = T.middle.shape[2]
     first = j - (taps - 1) // 2 - L.low[w, 1]
-    t0, t1 = max(0, -first), min(taps, L.size[w, 1] - first)
-    for q in (b - 2, b - 1, e, e + 1):
-        for f in range(4):
-            store(F, 4 * p + f, PAD + LANES * q, splat(0.0))
-    begin, end = e, b
-    for r in range(first + t0, first + t1):
-        if spans[r, 1] > spans[r, 0]:
-            begin, end = min(begin, int(spans[r, 0])), max(end, int(spans[r, 1]))
-    for q in range(max(begin, b - 1), min(end, e + 1)):
-        source, middle, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, T)
-        if t1 - t0 == SIX:
-            back_middle(Q, source, middle, slow, first + t0, q, j, p, t0, SIX, T)
-        else:
-            back_middle(Q, source, middle, slow, first + t0, q, j, p, t0, t1 - t0, T)
+    cells = row_of_cells(w, k, j, L, T)
+    begin, end = max(int(L.cells[cells, 2]), b - 1), min(int(L.cells[cells, 3]), e + 1)
+    for f in range(4):
+        clear_beside(place(F, f, PAD), b, e)
+    N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
+    if taps == 1:
+        one, two = row_of(Q, 2 * p, 0, nm, room.waste), row_of(Q, 2 * p + 1, 0, nm, room.waste)
+        for q in range(begin, end):
+            source, _, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, N, dN, T)
+            put(one + PACK * q, source)
+            put(two + PACK * q, slow)
+        return
+    for t in range(0, taps, SIX):
+        r = first + t
+        a0, d0 = row_of(Q, 2 * p, r, nm, room.waste), row_of(Q, 2 * p + 1, r, nm, room.waste)
+        a1, d1 = row_of(Q, 2 * p, r + 1, nm, room.waste), row_of(Q, 2 * p + 1, r + 1, nm, room.waste)
+        a2, d2 = row_of(Q, 2 * p, r + 2, nm, room.waste), row_of(Q, 2 * p + 1, r + 2, nm, room.waste)
+        a3, d3 = row_of(Q, 2 * p, r + 3, nm, room.waste), row_of(Q, 2 * p + 1, r + 3, nm, room.waste)
+        a4, d4 = row_of(Q, 2 * p, r + 4, nm, room.waste), row_of(Q, 2 * p + 1, r + 4, nm, room.waste)
+        a5, d5 = row_of(Q, 2 * p, r + 5, nm, room.waste), row_of(Q, 2 * p + 1, r + 5, nm, room.waste)
+        M, dM = six(T.middle, p, j, t), six(T.d_middle, p, j, t)
+        for q in range(begin, end):
+            source, middle, slow = back_fast(F, q, L.low[w, 2] + LANES * q, p, N, dN, T)
+            o = PACK * q
+            more(a0 + o, M[0] * source + dM[0] * middle)
+            more(a1 + o, M[1] * source + dM[1] * middle)
+            more(a2 + o, M[2] * source + dM[2] * middle)
+            more(a3 + o, M[3] * source + dM[3] * middle)
+            more(a4 + o, M[4] * source + dM[4] * middle)
+            more(a5 + o, M[5] * source + dM[5] * middle)
+            more(d0 + o, M[0] * slow)
+            more(d1 + o, M[1] * slow)
+            more(d2 + o, M[2] * slow)
+            more(d3 + o, M[3] * slow)
+            more(d4 + o, M[4] * slow)
+            more(d5 + o, M[5] * slow)
 
 
 @lean
-def back_fast(F: Floats, q: int, node: int, p: int, T: Tables) -> tuple[Pack, Pack, Pack]:
+def more(at: int, sums: Pack) -> None:
+    """Add to a pack in place."""
+    put(at, get(at) + sums)
+
+
+@lean
+def back_fast(F: Floats, q: int, node: int, p: int, N: Six, dN: Six, T: Tables) -> tuple[Pack, Pack, Pack]:
     """What a row of points gives to eight nodes: as such, along the middle axis' slopes, along the slow axis'."""
     taps = T.fast.shape[0] // 2
     at = PAD + LANES * q + taps // 2 - 1
-    source = splat(0.0)
+    space = T.middle.shape[2] > 1
     middle = splat(0.0)
-    slow = splat(0.0)
     if inner(node, T):
-        for t in range(SIX):
-            source = source + T.inner[p, t] * load(F, 4 * p, at - t)
-            source = source + T.d_inner[p, t] * load(F, 4 * p + 1, at - t)
-            slow = slow + T.inner[p, t] * load(F, 4 * p + 3, at - t)
-        if T.middle.shape[2] > 1:
-            for t in range(SIX):
-                middle = middle + T.inner[p, t] * load(F, 4 * p + 2, at - t)
-    else:
-        for t in range(taps):
-            N = load(T.fast_back, p * taps + t, GHOSTS + node)
-            source = source + N * load(F, 4 * p, at - t)
-            source = source + load(T.d_fast_back, p * taps + t, GHOSTS + node) * load(F, 4 * p + 1, at - t)
-            middle = middle + N * load(F, 4 * p + 2, at - t)
-            slow = slow + N * load(F, 4 * p + 3, at - t)
-    return source, middle, slow
+        here = PAD + LANES * q
+        source = dot(N, behind(place(F, 0, here))) + dot(dN, behind(place(F, 1, here)))
+        if space:
+            middle = dot(N, behind(place(F, 2, here)))
+        return source, middle, dot(N, behind(place(F, 3, here)))
+    row = BYTES * T.fast_back.shape[1]
+    N_i, dN_i = place(T.fast_back, p * taps, GHOSTS + node), place(T.d_fast_back, p * taps, GHOSTS + node)
+    source = sum_taps(place(F, 0, at), -BYTES, N_i, row, taps) + sum_taps(place(F, 1, at), -BYTES, dN_i, row, taps)
+    if space:
+        middle = sum_taps(place(F, 2, at), -BYTES, N_i, row, taps)
+    return source, middle, sum_taps(place(F, 3, at), -BYTES, N_i, row, taps)
 
 
 @lean
-def back_middle(
-    Q: Floats, source: Pack, middle: Pack, slow: Pack, r: int, q: int, j: int, p: int, t0: int, taps: int, T: Tables
-) -> None:
-    """Add that to the rows of nodes r ..., of taps t0 ... t0 + taps - 1."""
-    rows = Q.shape[0] // 4
-    place = PAD + LANES * q
-    for t in range(taps):
-        N, dN = T.middle[p, j, t0 + t], T.d_middle[p, j, t0 + t]
-        one, two = 2 * p * rows + r + t, (2 * p + 1) * rows + r + t
-        store(Q, one, place, load(Q, one, place) + N * source + dN * middle)
-        store(Q, two, place, load(Q, two, place) + N * slow)
-
-
-@lean
-def back_slow(rate: Floats, Q: Floats, spans: Integers, w: int, k: int, L: Layout, T: Tables) -> None:
+def back_slow(rate: Floats, w: int, k: int, L: Layout, T: Tables, room: Room) -> None:
     """rate += what Q gives to the planes of nodes that layer k sees."""
-    ns, nm, nf = L.size[w, 0], L.size[w, 1], L.size[w, 2]
+    Q, spans = room.Q, L.spans
+    rows = Q.shape[0] // 4
+    seen = L.span[w] + (k - L.layer[w]) * L.size[w, 1]
     taps = T.slow.shape[2]
     first = k - taps // 2 + 1 - L.low[w, 0]
-    t0, t1 = max(0, -first), min(taps, ns - first)
-    for r in range(nm):
-        at = L.offset[w] + ((first + t0) * nm + r) * nf
-        if t1 - t0 == SIX:
-            for q in range(spans[r, 0], spans[r, 1]):
-                give_slow(rate, Q, at, nm * nf, r, q, k, t0, SIX, T)
-        else:
-            for q in range(spans[r, 0], spans[r, 1]):
-                give_slow(rate, Q, at, nm * nf, r, q, k, t0, t1 - t0, T)
+    for t in range(0, taps, SIX):
+        at0, step0 = plane(rate, w, first + t, L, room.waste)
+        at1, step1 = plane(rate, w, first + t + 1, L, room.waste)
+        at2, step2 = plane(rate, w, first + t + 2, L, room.waste)
+        at3, step3 = plane(rate, w, first + t + 3, L, room.waste)
+        at4, step4 = plane(rate, w, first + t + 4, L, room.waste)
+        at5, step5 = plane(rate, w, first + t + 5, L, room.waste)
+        N, M = six(T.slow, 0, k, t), six(T.slow, 1, k, t)
+        dN, dM = six(T.d_slow, 0, k, t), six(T.d_slow, 1, k, t)
+        for r in range(L.size[w, 1]):
+            of0, of1 = place(Q, r, PAD), place(Q, rows + r, PAD)
+            of2, of3 = place(Q, 2 * rows + r, PAD), place(Q, 3 * rows + r, PAD)
+            for o in range(PACK * spans[seen + r, 0], PACK * spans[seen + r, 1], PACK):
+                fetch(at5 + (r + 2) * step5 + o)
+                a, da, b, db = get(of0 + o), get(of1 + o), get(of2 + o), get(of3 + o)
+                more(at0 + r * step0 + o, N[0] * a + dN[0] * da + M[0] * b + dM[0] * db)
+                more(at1 + r * step1 + o, N[1] * a + dN[1] * da + M[1] * b + dM[1] * db)
+                more(at2 + r * step2 + o, N[2] * a + dN[2] * da + M[2] * b + dM[2] * db)
+                more(at3 + r * step3 + o, N[3] * a + dN[3] * da + M[3] * b + dM[3] * db)
+                more(at4 + r * step4 + o, N[4] * a + dN[4] * da + M[4] * b + dM[4] * db)
+                more(at5 + r * step5 + o, N[5] * a + dN[5] * da + M[5] * b + dM[5] * db)
 
 
 @lean
-def give_slow(
-    rate: Floats, Q: Floats, at: int, stride: int, r: int, q: int, k: int, t0: int, taps: int, T: Tables
-) -> None:
-    """One pack of `back_slow`."""
-    rows = Q.shape[0] // 4
-    place = PAD + LANES * q
-    a, da = load(Q, r, place), load(Q, rows + r, place)
-    c, dc = load(Q, 2 * rows + r, place), load(Q, 3 * rows + r, place)
-    for t in range(taps):
-        node = at + t * stride + LANES * q
-        given = load(rate, 0, node) + T.slow[0, k, t0 + t] * a
-        given = given + T.d_slow[0, k, t0 + t] * da
-        given = given + T.slow[1, k, t0 + t] * c
-        store(rate, 0, node, given + T.d_slow[1, k, t0 + t] * dc)
-
-
-@lean
-def clear(Q: Floats, nm: int, nf: int) -> None:
-    """Q = 0 for a window of that size."""
+def clear_all(array: Floats, nm: int, first: int, last: int) -> None:
+    """Set packs first ... last - 1 of all rows of four arrays to 0."""
     for r in range(nm):
-        for q in range(nf // LANES):
-            clear_pack(Q, r, q)
+        clear_four(array, r, first, last)
 
 
 @lean_jit
@@ -368,37 +452,34 @@ def potential(
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
             add_sums(w, k, y, L, T, room)
-        along_slow(True, room.Z, room.spans, y, 0, k, L, T)
-        clear(room.Q, L.size[0, 1], L.size[0, 2])
+        B, E = along_slow(True, y, RHO, k, L, T, room)
+        clear_all(room.Q, L.size[0, 1], B, E)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
-            for p in range(2):
-                along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+            b, e = cells_of(RHO, k, j, L, T)
             for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
-                touching = False
+                u = along_middle(True, RHO, k, j, p, L, T, room)
+                N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
+                touching = splat(0.0)
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
-                    at = GHOSTS + c
-                    rho, d_fast, d_middle, d_slow = all_at(room.Y, q, c, p, T)
+                    at = column(c, T)
+                    rho, d_fast, d_middle, d_slow = all_at(u, PACK * q, c, p, N, dN, T)
                     overlap = load(room.sums, (2 + p) * count + j, at)
                     S2 = load(room.sums, (4 + p) * count + j, at)
                     S3 = load(room.sums, (6 + p) * count + j, at)
                     store(points.rho, kept, at, rho)
                     store(points.S2, kept, at, S2)
                     store(points.D, kept, at, mobility(rho, overlap, m))
-                    place = PAD + LANES * q
-                    store(room.F, 4 * p, place, w_p * df_drho(rho, S2, S3, m))
-                    store(room.F, 4 * p + 1, place, (w_p * m.kappa_rho) * d_fast)
-                    store(room.F, 4 * p + 2, place, (w_p * m.kappa_rho) * d_middle)
-                    store(room.F, 4 * p + 3, place, (w_p * m.kappa_rho) * d_slow)
-                    if rigid and total(positive(overlap - m.c)) > 0.0:
-                        touching = True
-                if touching:
+                    store(room.F, 0, PAD + LANES * q, w_p * df_drho(rho, S2, S3, m))
+                    store(room.F, 1, PAD + LANES * q, (w_p * m.kappa_rho) * d_fast)
+                    store(room.F, 2, PAD + LANES * q, (w_p * m.kappa_rho) * d_middle)
+                    store(room.F, 3, PAD + LANES * q, (w_p * m.kappa_rho) * d_slow)
+                    touching = touching + positive(overlap - m.c)
+                if rigid and total(touching) > 0.0:
                     meet_row(found, where, points, y, kept, k, j, p, first_layer, L, T, room, m)
-            for p in range(2):
-                back(room.Q, room.F, room.spans, 0, j, p, b, e, L, T)
-        back_slow(W, room.Q, room.spans, 0, k, L, T)
+                back(RHO, k, j, p, b, e, L, T, room)
+        back_slow(W, RHO, k, L, T, room)
     restore_denormals(mode)
 
 
@@ -406,18 +487,18 @@ def potential(
 def add_sums(w: int, k: int, y: Floats, L: Layout, T: Tables, room: Room) -> None:
     """Add one order parameter to the sums of a layer's points."""
     count = T.middle.shape[1]
-    along_slow(False, room.Z, room.spans, y, w, k, L, T)
+    along_slow(False, y, w, k, L, T, room)
     for j in range(max(0, L.low[w, 1] - 1), min(count, L.low[w, 1] + L.size[w, 1])):
-        b, e = cells_of(w, k, j, L)
+        b, e = cells_of(w, k, j, L, T)
         if e <= b:
             continue
         for p in range(2):
-            along_middle(False, room.Y, room.Z, room.spans, w, j, p, L, T)
-        for p in range(2):
+            u = along_middle(False, w, k, j, p, L, T, room).value
+            N = six(T.inner, p, 0, 0)
             for q in range(b, e):
                 c = L.low[w, 2] + LANES * q
-                at = GHOSTS + c
-                eta = value_at(room.Y, q, c, p, T)
+                at = column(c, T)
+                eta = value_at(u + PACK * q, c, p, N, T)
                 inside = positive(eta)
                 S1 = load(room.sums, p * count + j, at)
                 overlap = load(room.sums, (2 + p) * count + j, at)
@@ -437,12 +518,12 @@ def meet_row(
     dim = where.shape[1]
     width = 1 + dim
     fields, here, particle = room.fields, room.here, room.particle
-    b, e = cells_of(0, k, j, L)
+    b, e = cells_of(RHO, k, j, L, T)
     for q in range(b, e):
         c = L.low[0, 2] + LANES * q
-        if not total(positive(load(room.sums, (2 + p) * count + j, GHOSTS + c) - m.c)) > 0.0:
+        if not total(positive(load(room.sums, (2 + p) * count + j, column(c, T)) - m.c)) > 0.0:
             continue
-        seen = 0
+        seen = np.int64(0)  # a literal would be compiled once more
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
             if (
@@ -456,7 +537,7 @@ def meet_row(
             for one in range(seen):
                 for two in range(one + 1, seen):
                     if here[one, lane] > 0.0 and here[one, lane] * here[two, lane] > FAR * m.c:
-                        fields[0, 0] = points.rho[kept, GHOSTS + c + lane]
+                        fields[0, 0] = points.rho[kept, column(c, T) + lane]
                         for f in range(width):
                             fields[width + f, 0] = here[one, f * LANES + lane]
                             fields[2 * width + f, 0] = here[two, f * LANES + lane]
@@ -465,7 +546,7 @@ def meet_row(
                             found, fields, 0, 0, width, 0, 2 * width, 0, particle[one], particle[two], r, T.weight, m.c
                         )
                         if found.number[0] > r and r < len(where):
-                            where[r, 0] = T.x[p, GHOSTS + c + lane]
+                            where[r, 0] = T.x[p, column(c, T) + lane]
                             where[r, 1] = T.z[p, k] if dim == 2 else T.y[p, j]
                             where[r, dim - 1] = T.z[p, k]
 
@@ -505,8 +586,8 @@ def eight(here: Floats, row: int, y: Floats, w: int, k: int, j: int, p: int, c: 
             if is_inner:
                 for f in range(SIX):
                     v = load(y, 0, at + f)
-                    u = u + T.inner[p, f] * v
-                    du = du + T.d_inner[p, f] * v
+                    u = u + T.inner[p, 0, f] * v
+                    du = du + T.d_inner[p, 0, f] * v
             else:
                 for f in range(fast_taps):
                     v = load(y, 0, at + f)
@@ -546,18 +627,18 @@ def divergence(
             room.swept[:] = 0.0
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             change(L.window[i], k, rate, points, motion, y, L, T, room, m, rigid, huang, first_layer, layers)
-        along_slow(True, room.Z, room.spans, W, 0, k, L, T)
-        clear(room.Q, L.size[0, 1], L.size[0, 2])
+        B, E = along_slow(True, W, RHO, k, L, T, room)
+        clear_all(room.Q, L.size[0, 1], B, E)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
-            for p in range(2):
-                along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
+            b, e = cells_of(RHO, k, j, L, T)
             for p in range(2):
                 kept = (p * layers + k - first_layer) * count + j
+                u = along_middle(True, RHO, k, j, p, L, T, room)
+                N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
-                    at = GHOSTS + c
-                    _, fast, middle, slow = all_at(room.Y, q, c, p, T)
+                    at = column(c, T)
+                    _, fast, middle, slow = all_at(u, PACK * q, c, p, N, dN, T)
                     D = load(points.D, kept, at)
                     fast = splat(0.0) - D * fast
                     middle = splat(0.0) - D * middle
@@ -567,14 +648,12 @@ def divergence(
                         fast = fast + rho * load(room.swept, p * count + j, at)
                         middle = middle + rho * load(room.swept, (2 + p) * count + j, at)
                         slow = slow + rho * load(room.swept, (4 + p) * count + j, at)
-                    place = PAD + LANES * q
-                    store(room.F, 4 * p, place, splat(0.0))
-                    store(room.F, 4 * p + 1, place, w_p * fast)
-                    store(room.F, 4 * p + 2, place, w_p * middle)
-                    store(room.F, 4 * p + 3, place, w_p * slow)
-            for p in range(2):
-                back(room.Q, room.F, room.spans, 0, j, p, b, e, L, T)
-        back_slow(rate, room.Q, room.spans, 0, k, L, T)
+                    store(room.F, 0, PAD + LANES * q, splat(0.0))
+                    store(room.F, 1, PAD + LANES * q, w_p * fast)
+                    store(room.F, 2, PAD + LANES * q, w_p * middle)
+                    store(room.F, 3, PAD + LANES * q, w_p * slow)
+                back(RHO, k, j, p, b, e, L, T, room)
+        back_slow(rate, RHO, k, L, T, room)
     restore_denormals(mode)
 
 
@@ -589,22 +668,22 @@ def change(
     w_p = T.weight
     a = w - 1
     spread = -m.L * m.kappa_eta * w_p
-    along_slow(True, room.Z, room.spans, y, w, k, L, T)
-    clear(room.Q, L.size[w, 1], L.size[w, 2])
+    B, E = along_slow(True, y, w, k, L, T, room)
+    clear_all(room.Q, L.size[w, 1], B, E)
     for j in range(max(0, L.low[w, 1] - 1), min(count, L.low[w, 1] + L.size[w, 1])):
-        b, e = cells_of(w, k, j, L)
+        b, e = cells_of(w, k, j, L, T)
         if e <= b:
             continue
         for p in range(2):
-            along_middle(True, room.Y, room.Z, room.spans, w, j, p, L, T)
-        for p in range(2):
             kept = (p * layers + k - first_layer) * count + j
+            u = along_middle(True, w, k, j, p, L, T, room)
+            N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
             height, depth = (T.z[p, k], 0.0) if plane else (T.y[p, j], T.z[p, k])
             v_x = motion[a, 0] + motion[a, 4] * depth - motion[a, 5] * height
             for q in range(b, e):
                 c = L.low[w, 2] + LANES * q
-                at = GHOSTS + c
-                eta, fast, middle, slow = all_at(room.Y, q, c, p, T)
+                at = column(c, T)
+                eta, fast, middle, slow = all_at(u, PACK * q, c, p, N, dN, T)
                 rho, S2 = load(points.rho, kept, at), load(points.S2, kept, at)
                 fast = spread * fast
                 middle = spread * middle
@@ -625,14 +704,12 @@ def change(
                         slow = slow + square * v_z
                         add_to(room.swept, (2 + p) * count + j, at, swept * v_y)
                         add_to(room.swept, (4 + p) * count + j, at, swept * v_z)
-                place = PAD + LANES * q
-                store(room.F, 4 * p, place, (-m.L * w_p) * df_deta(eta, rho, S2, m))
-                store(room.F, 4 * p + 1, place, fast)
-                store(room.F, 4 * p + 2, place, middle)
-                store(room.F, 4 * p + 3, place, slow)
-        for p in range(2):
-            back(room.Q, room.F, room.spans, w, j, p, b, e, L, T)
-    back_slow(rate, room.Q, room.spans, w, k, L, T)
+                store(room.F, 0, PAD + LANES * q, (-m.L * w_p) * df_deta(eta, rho, S2, m))
+                store(room.F, 1, PAD + LANES * q, fast)
+                store(room.F, 2, PAD + LANES * q, middle)
+                store(room.F, 3, PAD + LANES * q, slow)
+            back(w, k, j, p, b, e, L, T, room)
+    back_slow(rate, w, k, L, T, room)
 
 
 @lean
@@ -709,30 +786,30 @@ def energy(
         room.sums[:] = 0.0
         for i in range(L.first[k - first_layer], L.first[k - first_layer + 1]):
             w = L.window[i]
-            along_slow(True, room.Z, room.spans, y, w, k, L, T)
+            along_slow(True, y, w, k, L, T, room)
             for j in range(max(0, L.low[w, 1] - 1), min(count, L.low[w, 1] + L.size[w, 1])):
-                b, e = cells_of(w, k, j, L)
+                b, e = cells_of(w, k, j, L, T)
                 for p in range(2):
-                    along_middle(True, room.Y, room.Z, room.spans, w, j, p, L, T)
-                for p in range(2):
+                    u = along_middle(True, w, k, j, p, L, T, room)
+                    N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                     for q in range(b, e):
                         c = L.low[w, 2] + LANES * q
-                        eta, x, v, z = all_at(room.Y, q, c, p, T)
-                        at, square = GHOSTS + c, x * x + v * v + z * z
+                        eta, x, v, z = all_at(u, PACK * q, c, p, N, dN, T)
+                        at, square = column(c, T), x * x + v * v + z * z
                         for f, more in ((0, square), (4, eta * eta), (6, eta * eta * eta)):
                             add_to(room.sums, (f + p) * count + j, at, more)
                         steep = load(room.sums, (2 + p) * count + j, at) + positive(square - eps_eta * eps_eta)
                         store(room.sums, (2 + p) * count + j, at, steep)
-        along_slow(True, room.Z, room.spans, y, 0, k, L, T)
+        along_slow(True, y, RHO, k, L, T, room)
         for j in range(count):
-            b, e = cells_of(0, k, j, L)
+            b, e = cells_of(RHO, k, j, L, T)
             for p in range(2):
-                along_middle(True, room.Y, room.Z, room.spans, 0, j, p, L, T)
-            for p in range(2):
+                u = along_middle(True, RHO, k, j, p, L, T, room)
+                N, dN = six(T.inner, p, 0, 0), six(T.d_inner, p, 0, 0)
                 for q in range(b, e):
                     c = L.low[0, 2] + LANES * q
-                    at = GHOSTS + c
-                    rho, x, v, z = all_at(room.Y, q, c, p, T)
+                    at = column(c, T)
+                    rho, x, v, z = all_at(u, PACK * q, c, p, N, dN, T)
                     square = x * x + v * v + z * z
                     S2, S3 = load(room.sums, (4 + p) * count + j, at), load(room.sums, (6 + p) * count + j, at)
                     density = free_energy_density(rho, S2, S3, m) + 0.5 * m.kappa_rho * square
@@ -798,10 +875,11 @@ def step_error(
 
 
 @lean_jit
-def extremes(found: Floats, values: Floats, layers: int, count: int, cells: int, edges: Floats) -> None:
+def extremes(found: Floats, values: Floats, layers: int, count: int, first: int, cells: int, edges: Floats) -> None:
     """found = least value, largest, largest next to a wall of `Points.rho`, and 1 where one is not a number.
 
-    edges (2,): whether the rank's first and last layer are at a wall; count: rows of cells in a layer.
+    edges (2,): whether the rank's first and last layer are at a wall; count: rows of cells in a layer; first: column of
+    the first cell.
     """
     for p in range(2):
         for k in range(layers):
@@ -809,12 +887,12 @@ def extremes(found: Floats, values: Floats, layers: int, count: int, cells: int,
                 row = values[(p * layers + k) * count + j]
                 wall = (k == 0 and edges[0] > 0.0) or (k == layers - 1 and edges[1] > 0.0)
                 wall |= count > 1 and (j == 0 or j == count - 1)
-                for i in range(GHOSTS, GHOSTS + cells):
+                for i in range(first, first + cells):
                     value = row[i]
                     if value != value:
                         found[3] = 1.0
                     found[0] = min(found[0], value)
-                    if wall or i == GHOSTS or i == GHOSTS + cells - 1:
+                    if wall or i == first or i == first + cells - 1:
                         found[2] = max(found[2], value)
                     else:
                         found[1] = max(found[1], value)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import contacts, elimination, rigid
-from ..arrays import Floats, Integers
+from ..arrays import Floats, Integers, zeros
 from ..case import Case
 from ..energy import Coefficients
 from ..geometry import MeshError
@@ -43,6 +43,11 @@ class Lattice:
     def reach(self) -> int:
         """How many nodes on each side a point sees."""
         return self.axes[0].reach
+
+    @property
+    def column(self) -> int:
+        """Where the first cell is in rows of points; see `loops.column`."""
+        return GHOSTS + self.axes[2].reach
 
     @property
     def nodes(self) -> tuple[int, int, int]:
@@ -143,8 +148,8 @@ def make_lattice(case: Case, axes: Axes, ranks: Ranks, work: Floats) -> Lattice:
     tables = Tables(
         slow.N, slow.dN, one if middle is None else middle.N, none if middle is None else middle.dN,
         fast.by_cell(fast.N), fast.by_cell(fast.dN), fast.by_node(fast.N), fast.by_node(fast.dN),
-        fast.N[:, fast.cells // 2].copy(), fast.dN[:, fast.cells // 2].copy(),
-        np.pad(centred(fast), ((0, 0), (GHOSTS, GHOSTS))), centred(middle), centred(slow), weight,
+        fast.N[:, fast.cells // 2, None].copy(), fast.dN[:, fast.cells // 2, None].copy(),
+        np.pad(centred(fast), ((0, 0), (GHOSTS + fast.reach, GHOSTS))), centred(middle), centred(slow), weight,
     )  # fmt: skip
     alone = np.array([[[1.0], [1.0]], [[0.0], [0.0]]])
     sums = [
@@ -200,13 +205,14 @@ class LatticeScheme:
         cells = 1 if g.axes[1] is None else g.axes[1].cells
         P = windows.whole_packs(g.tables.fast.shape[1])
         self.room = Room(
-            np.zeros((4 * rows, width)), np.zeros((4 * rows, width)), np.zeros((6, width)), np.zeros((8, width)),
-            np.zeros((rows, 2), dtype=np.int64), np.zeros((8 * cells, P)), np.zeros((6 * cells, P)), np.zeros((12, 1)),
-            np.zeros((64, 4 * LANES)), np.zeros(64, dtype=np.int64),
+            zeros(4 * rows, width), zeros(4 * rows, width), zeros(3, width), zeros(4, width), zeros(1, width),
+            zeros(1, width), zeros(8 * cells, P), zeros(6 * cells, P),
+            np.zeros((12, 1)), zeros(64, 4 * LANES),
+            np.zeros(64, dtype=np.int64),
         )  # fmt: skip
         if not hasattr(self, "points"):
-            self.points = Points(*(np.zeros((2 * len(g.layers) * cells, P)) for _ in range(3)))
-            self.W = np.zeros((1, self.rho))
+            self.points = Points(*(zeros(2 * len(g.layers) * cells, P) for _ in range(3)))
+            self.W = zeros(1, self.rho)
             low, size = self.layout.low[:1], self.layout.size[:1]
             self.halo_W = g.halo(self.layout._replace(offset=self.layout.offset[:2], low=low, size=size))
         self.halo = g.halo(self.layout)
@@ -275,7 +281,9 @@ class LatticeScheme:
 
     def vector(self, state: LatticeState) -> Floats:
         """A copy of the state's fields."""
-        return state.y.copy()
+        y = zeros(state.y.size)
+        y[:] = state.y
+        return y
 
     def keep(self, state: LatticeState, y: Floats) -> None:
         """Make y the state's fields."""

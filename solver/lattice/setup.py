@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import checkpoint
-from ..arrays import Array, Floats, Integers
+from ..arrays import Array, Floats, Integers, zeros
 from ..case import Box, Case
 from ..integrators import Integrator, integrator_of
 from ..output import Fields
@@ -65,7 +65,7 @@ class LatticeSetup:
         lattice = make_lattice(self.case, self.axes, self.ranks, self._work(boxes))
         scheme = LatticeScheme(lattice, boxes)
         if kept:
-            y = np.zeros(int(scheme.layout.offset[-1]))
+            y = zeros(int(scheme.layout.offset[-1]))
             slabs = list(slabs_of(lattice, scheme.layout, boxes, lattice.planes))
             for slab, rows in zip(slabs, checkpoint.rows(kept.directory, "y", (s.there for s in slabs)), strict=True):
                 y[slab.here] = rows

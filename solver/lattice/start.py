@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..arrays import Floats, Integers
+from ..arrays import Floats, Integers, zeros
 from ..case import Case
 from ..state import TAIL, profile, reach, surface_distance
 from . import windows
@@ -42,7 +42,7 @@ def first_boxes(case: Case, axes: Axes) -> Boxes:
 
 def initial_fields(case: Case, lattice: Lattice, layout: Layout) -> Floats:
     """The fields (34) at the nodes: rho = min(sum eta, 1), and eta_a in its window where it is at least eps_eta."""
-    y = np.zeros(int(layout.offset[-1]))
+    y = zeros(int(layout.offset[-1]))
     few, xi, radii = case.activation.few_order_parameters, case.particles.interface_width, reach(case)
     cut = max(case.activation.eps_eta, TAIL)
     n, held = lattice.nodes, lattice.planes
@@ -104,7 +104,7 @@ def move(scheme: LatticeScheme, boxes: Boxes, *vectors: Floats) -> list[Floats]:
     scheme.lay_out(boxes)
     moved = []
     for vector in vectors:
-        new = np.zeros(int(scheme.layout.offset[-1]))
+        new = zeros(int(scheme.layout.offset[-1]))
         windows.carry(new, scheme.layout, vector, old)
         moved.append(new)
     return moved

@@ -31,6 +31,12 @@ class Layout(NamedTuple):
     end: Numbers
     first: Integers  # (layers + 1,) of the windows with points in each layer of cells:
     window: Numbers  # window[first[k]] ... window[first[k + 1] - 1], k from the rank's first layer on
+    layer: Integers  # (w,) its first layer on the rank
+    span: Integers  # (w,) where its part of `spans` begins, layer by layer, row by row of nodes
+    cell: Integers  # (w,) and its part of `cells`, where a layer has one row more
+    spans: Numbers  # (s, 2) packs of the row in which a node that the layer sees is in the window: begin and end
+    cells: Numbers  # (c, 4) packs of the row of cells in which one has a corner in the window: begin and end; and
+    # those which the spans of the rows of nodes hold that it sees
 
 
 @dataclass(frozen=True)
@@ -104,28 +110,80 @@ def lay_out(boxes: Boxes, nodes: tuple[int, int, int], reach: int, planes: tuple
     tops = low[:, 0] + size[:, 0]
     there = np.arange(1, len(low))[size[1:, 0] > 0]
     seen = [there[(low[there, 0] - 1 <= k) & (k < tops[there])] for k in layers]
-    counts = np.concatenate([[0], np.cumsum([len(some) for some in seen])])
-    return Layout(offset, low, size, row, joined(begins), joined(ends), counts, joined(seen))
+    counts = np.concatenate([[0], np.cumsum([len(some) for some in seen], dtype=np.int64)])
+    begin_, end_ = joined(begins), joined(ends)
+    layer = np.clip(low[:, 0] - 1, layers.start, layers.stop)
+    held_ = np.where(size[:, 0] > 0, np.clip(tops, layers.start, layers.stop) - layer, 0)
+    span, cell = (np.concatenate([[0], np.cumsum(held_ * (size[:, 1] + more), dtype=np.int64)]) for more in (0, 1))
+    spans, cells = (np.zeros((int(last[-1]), width), dtype=np.int32) for last, width in ((span, 2), (cell, 4)))
+    _find_spans(spans, cells, begin_, end_, low, size, row, layer, held_, reach, nodes[1] > 1)
+    return Layout(
+        offset, low, size, row, begin_, end_, counts, joined(seen), layer, span[:-1], cell[:-1], spans, cells
+    )
+
+
+@jit
+def _find_spans(
+    spans: Numbers, cells: Numbers, begin: Numbers, end: Numbers, low: Integers, size: Integers, row: Integers,
+    layer: Integers, held: Integers, reach: int, space: bool,
+) -> None:
+    """Fill in `Layout.spans` and `Layout.cells`."""
+    first = at = 0
+    for w in range(len(low)):
+        ns, nm, nf = size[w, 0], size[w, 1], size[w, 2]
+        for i in range(held[w]):
+            s = layer[w] + i - low[w, 0]  # the plane before the layer
+            for m in range(nm):
+                b, e = _packs(begin, end, row[w], ns, nm, nf, s - reach + 1, s + reach, m, m, 0)
+                spans[first + m, 0] = b
+                spans[first + m, 1] = e
+            for j in range(nm + 1):  # the row of cells before row j of nodes; in the plane, that of row 0
+                near, far = (j - 1, j) if space else (0, 0)
+                b, e = _packs(begin, end, row[w], ns, nm, nf, s, s + 1, near, far, 1)
+                cells[at, 0] = b
+                cells[at, 1] = e
+                cells[at, 2] = nf // LANES
+                cells[at, 3] = 0
+                for m in range(max(0, j - reach), min(nm, j + reach)):
+                    if spans[first + m, 1] > spans[first + m, 0]:
+                        cells[at, 2] = min(cells[at, 2], spans[first + m, 0])
+                        cells[at, 3] = max(cells[at, 3], spans[first + m, 1])
+                at += 1
+            first += nm
+
+
+@jit
+def _packs(
+    begin: Numbers, end: Numbers, row: int, ns: int, nm: int, nf: int, s_0: int, s_1: int, m_0: int, m_1: int,
+    before: int,
+) -> tuple[int, int]:
+    """Packs that hold the intervals, and so many nodes before, of rows m_0 ... m_1 on planes s_0 ... s_1."""
+    first, last = nf, 0
+    for s in range(max(0, s_0), min(ns, s_1 + 1)):
+        for m in range(max(0, m_0), min(nm, m_1 + 1)):
+            if end[row + s * nm + m] > begin[row + s * nm + m]:
+                first, last = min(first, begin[row + s * nm + m]), max(last, end[row + s * nm + m])
+    return (max(first - before, 0) // LANES, -(-last // LANES)) if last > first else (0, 0)
 
 
 @jit
 def carry(new: Floats, to: Layout, old: Floats, of: Layout) -> None:
     """Copy all fields from one layout into another, as far as both have them; new is 0 before."""
     for w in range(len(to.low)):
-        shift = to.low[w] - of.low[w]
+        up, aside, ahead = to.low[w, 0] - of.low[w, 0], to.low[w, 1] - of.low[w, 1], to.low[w, 2] - of.low[w, 2]
         for s in range(to.size[w, 0]):
-            z = s + shift[0]
+            z = s + up
             if z < 0 or z >= of.size[w, 0]:
                 continue
             for m in range(to.size[w, 1]):
-                y = m + shift[1]
+                y = m + aside
                 if y < 0 or y >= of.size[w, 1]:
                     continue
                 row, before = to.row[w] + s * to.size[w, 1] + m, of.row[w] + z * of.size[w, 1] + y
-                begin = max(to.begin[row], of.begin[before] - shift[2])
-                end = min(to.end[row], of.end[before] - shift[2])
+                begin = max(to.begin[row], of.begin[before] - ahead)
+                end = min(to.end[row], of.end[before] - ahead)
                 target = to.offset[w] + (s * to.size[w, 1] + m) * to.size[w, 2]
-                source = of.offset[w] + (z * of.size[w, 1] + y) * of.size[w, 2] + shift[2]
+                source = of.offset[w] + (z * of.size[w, 1] + y) * of.size[w, 2] + ahead
                 for i in range(begin, end):
                     new[target + i] = old[source + i]
 

@@ -4,11 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from test_server_commands import CASE, SWEEP, folder, frit, serving
+from commands import CASE, SWEEP, frit, serving
 
 from frit.service.cli.jobs import keep_of
 
-__all__ = ["folder"]
 MESH = "6.5,6.2,5.0\n15.4,6.8,4.0\n"
 
 

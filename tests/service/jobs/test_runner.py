@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import psutil
 import pytest
+from places import SUPPORT
 from serving import ended, in_state, new_job, settings, submit, until
 from soak import of_data
 
@@ -212,7 +213,7 @@ asyncio.run(main())
 def test_runners_outlive_the_service_and_are_adopted(tmp_path: Path, how: signal.Signals) -> None:
     """One still runs, one ends while nobody looks: the next service takes up both, and neither is run again."""
     data = tmp_path / "data"
-    command = [sys.executable, "-P", "-c", ENGINE, str(data), str(Path(__file__).parent)]
+    command = [sys.executable, "-P", "-c", ENGINE, str(data), str(SUPPORT)]
 
     async def after(jobs: list[Job], pid: int) -> None:
         async with Engine(settings(data)) as engine:

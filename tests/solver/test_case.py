@@ -1,23 +1,22 @@
 """The case file: what is accepted, how it is filled in, what is refused and in which words."""
 
-import copy
 import itertools
 import json
 import math
 import pickle
 import re
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from cases import altered, minimal, tables
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from frit.solver.case import Case, CaseError, Model, Output, Problem, Table, case_schema, load_case, parse_case
+from frit.solver.case import Case, CaseError, Model, Output, Problem, case_schema, load_case, parse_case
 
 Tree = dict[str, Any]
 
@@ -75,30 +74,6 @@ PACKING = {
 }
 BOXES = {"shape": "box", "centres": [[20, 20], [50.0, 20.0]], "sizes": [[20.0, 10.0], [40.0, 10.0]]}
 CUBE = {"domain": {"size": [40, 40, 40]}, "particles": {"centres": [[20, 20, 20]], "radii": [10]}}
-
-
-def minimal() -> Tree:
-    """Only what has no default."""
-    return {
-        "domain": {"size": [100, 60]},
-        "nodes": {"spacing": 1},
-        "particles": {"centres": [[30, 30], [70, 30]], "radii": [20, 20]},
-        "time": {"end": 10},
-    }
-
-
-def altered(changes: Mapping[str, Any]) -> Tree:
-    """The minimal case with dotted keys set; None takes the key away."""
-    tree = minimal()
-    for key, value in changes.items():
-        *tables, last = key.split(".")
-        table = tree
-        for name in tables:
-            table = table.setdefault(name, {})
-        table[last] = copy.deepcopy(value)
-        if value is None:
-            del table[last]
-    return tree
 
 
 def outcome(tree: Any) -> Case | CaseError:
@@ -499,10 +474,6 @@ def test_identity_differs(changes: Tree) -> None:
 def test_identity_does_not_see_the_sign_of_zero() -> None:
     plus, minus = (parse_case(altered({"model.B": zero, "output.snapshots": [zero]})) for zero in (0.0, -0.0))
     assert plus.identity() == minus.identity()
-
-
-def tables(table: type[Table] = Table) -> list[type[Table]]:
-    return [sub for direct in table.__subclasses__() for sub in (direct, *tables(direct))]
 
 
 def test_the_schema_describes_every_field() -> None:

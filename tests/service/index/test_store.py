@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from indexing import LIMIT, attempted, claim, done, ended, is_whole, lines, new, opened, points, started
+from places import SUPPORT
 
 from frit.service.index import writer as writer_module
 from frit.service.index.records import Key, KeyReusedError, NewPoint, NotFoundError, StoreError
@@ -80,7 +81,7 @@ with opened(Path(sys.argv[1])) as store:
 
 def test_what_was_acknowledged_before_kill_9_is_there(tmp_path: Path) -> None:
     command = [sys.executable, "-c", KILLED, str(tmp_path)]
-    killed = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    killed = subprocess.run(command, cwd=SUPPORT, capture_output=True, text=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     told = killed.stdout.split()
     assert len(told) == 39

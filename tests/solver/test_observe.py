@@ -1,13 +1,14 @@
 """What is measured, against fields whose integrals, distances and necks are known."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import permutations, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from boxes import boxes
 from launching import Case
+from places import ROOT
 from reference import mean_in_box
 from scipy.spatial import ConvexHull
 
@@ -21,7 +22,7 @@ from frit.solver.observe import Observables, box_weights
 from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh, prepare
 
-PACK = Path(__file__).parent.parent / "sweeps/cases/pack.toml"
+PACK = ROOT / "sweeps/cases/pack.toml"
 SIZES = {2: (30.0, 26.0), 3: (16.0, 15.0, 14.0)}
 RADIUS = {2: 9.0, 3: 5.0}
 FUNCTIONS: list[dict[str, Any]] = [*({"kind": "lme", "gamma": g} for g in (0.8, 1.8, 4.0)), {"kind": "linear"}]
@@ -55,17 +56,6 @@ def subdivided(low: Floats, high: Floats, field: Callable[[Floats], Floats], cut
     """The mean of a field over a box by midpoints: exact to (box / cuts)^2 / 24 times the curvature."""
     axes = [a + (np.arange(cuts) + 0.5) * (b - a) / cuts for a, b in zip(low, high, strict=True)]
     return float(field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)).mean())
-
-
-def boxes(size: tuple[float, ...]) -> Iterator[tuple[Floats, Floats]]:
-    """On nodes, through cells, thinner than a cell, within one cell, up to the walls."""
-    full, ones = np.array(size), np.ones(len(size))
-    yield 0.0 * full, full
-    yield ones, full - 1.0
-    yield 0.3137 * full, 0.7713 * full
-    yield 0.41 * full, 0.41 * full + 0.05 * ones
-    yield 0.0 * full, np.where(np.arange(len(size)) == 0, 0.123, full)
-    yield np.where(np.arange(len(size)) == 1, 2.2, 0.5), np.where(np.arange(len(size)) == 1, 2.9, full - 0.25)
 
 
 # --- vacancy ratio --------------------------------------------------------------------------------------

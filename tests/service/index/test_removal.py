@@ -15,8 +15,9 @@ import httpx2
 import pytest
 from asking import Process
 from indexing import attempted, done, lines, new, opened, points, rows
+from places import SUPPORT
+from requesting import case
 from serving import ended, new_job, settings, stand_in, submit
-from test_verbs import case
 
 from frit.service.index.reindex import rebuild
 from frit.service.index.removals import InUseError
@@ -68,7 +69,7 @@ async def two_ended(data: Path) -> list[str]:
 
 def killed_at(point: str, data: Path, *jobs: str) -> None:
     command = [sys.executable, "-c", CHILD, str(data), point, *jobs]
-    child = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=120, check=False)
+    child = subprocess.run(command, cwd=SUPPORT, capture_output=True, text=True, timeout=120, check=False)
     assert child.returncode == -signal.SIGKILL, child.stderr
 
 

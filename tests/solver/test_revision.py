@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cases import tables
 from indexing import attempted, done, new, opened
-from test_case import tables
+from places import DATA
 
 from frit.service.index.records import NewPoint
 from frit.service.index.store import Store
@@ -17,7 +18,7 @@ from frit.solver.case import Case, Model, fingerprint, parse_case
 from frit.solver.revision import FIRST, REVISION, revision_of
 from frit.solver.variations import Variations, identity
 
-STORED = json.loads((Path(__file__).parent / "data" / "identities.json").read_text())
+STORED = json.loads((DATA / "identities.json").read_text())
 OTHER = FIRST - 1  # stands for the number of a revision that computed something and is not the present one
 
 # --- identity ---------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import pytest
 from engines import finished, job, runs_of, settings, stand_in, submit, until
 from indexing import is_whole
 from launching import PAIR
+from places import SUPPORT
 
 from frit.service.index import writer as writer_module
 from frit.service.index.records import StoreError
@@ -218,7 +219,7 @@ def test_a_clock_that_jumps_changes_nothing(tmp_path: Path) -> None:
     fake = {
         "LD_PRELOAD": str(library), "FAKETIME_TIMESTAMP_FILE": str(tmp_path / "clock"), "FAKETIME_NO_CACHE": "1",
         "FAKETIME_DONT_FAKE_MONOTONIC": "1", "NO_FAKE_STAT": "1", "FAKETIME_DISABLE_SHM": "1",
-        "FRIT_MPIRUN": str(stand_in(tmp_path / "bin")),
+        "FRIT_MPIRUN": str(stand_in(tmp_path / "bin")), "PYTHONPATH": str(SUPPORT),
     }  # fmt: skip
     ended = subprocess.run(
         [sys.executable, __file__, str(tmp_path)], env=os.environ | fake, capture_output=True, text=True, check=False,

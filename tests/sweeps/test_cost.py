@@ -1,11 +1,11 @@
 """The cost of a case: the model against recorded counts, what past runs change, and the plan of a sweep."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from places import ROOT
 from scipy.spatial import cKDTree
 from simulate import simulate
 
@@ -35,7 +35,7 @@ PACK = DISCS | {
     "time": {"end": 4.0},
 }
 STILL = {"rigid_motion": False}
-CASES = Path(__file__).parents[1] / "sweeps" / "cases"
+CASES = ROOT / "sweeps" / "cases"
 
 
 def resolved(tree: Tree, **tables: Tree) -> Tree:

@@ -18,13 +18,13 @@ import httpx2
 import pytest
 import yaml
 from asking import LONG, TINY, free_port
+from places import ROOT
 
 from frit.service.client import Client
 from frit.service.http.app import create_app
 from frit.service.jobs.launch import kill_marked
 from frit.service.settings import Settings
 
-ROOT = Path(__file__).parents[1]
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())
 TIMEOUT = 300.0  # seconds; there for hangs

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from asking import TINY, final, gmsh_text, service
 from fastapi.testclient import TestClient
+from requesting import SWEEP, case, kind, upload
 from serving import stand_in
 
 from frit.service.index.store import Store
 
 Tree = dict[str, Any]
-SWEEP: Tree = {"name": "two", "base": {**TINY, "name": "sleep 0"}, "axes": {"model.D_surf": [2.0, 4.0]}}
-
-
 @pytest.fixture
 def idle(tmp_path: Path) -> Iterator[TestClient]:
     """Starts nothing."""
@@ -32,19 +30,10 @@ def busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient
         yield client
 
 
-def case(name: str, shift: float = 0.0) -> Tree:
-    centres = [[6.5, 6.2], [15.4 + shift, 6.8]]
-    return {**TINY, "name": name, "particles": {**TINY["particles"], "centres": centres}}
-
-
 def submit(client: TestClient, name: str, shift: float = 0.0, **more: Any) -> str:
     answer = client.post("/v1/jobs", json={"case": case(name, shift), **more})
     assert answer.status_code == 201, answer.text
     return str(answer.json()["id"])
-
-
-def kind(answer: Any) -> tuple[int, str]:
-    return answer.status_code, answer.json()["type"].rpartition("/")[2]
 
 
 # --- deleting ---------------------------------------------------------------------------------------------
@@ -187,11 +176,6 @@ def square(size: int) -> bytes:
     first = [i * size + j for i in range(size - 1) for j in range(size - 1)]
     cells = [[k, k + size, k + 1] for k in first] + [[k + size, k + size + 1, k + 1] for k in first]
     return gmsh_text(np.column_stack([x, y]).tolist(), cells)
-
-
-def upload(client: TestClient, content: bytes, name: str = "mesh.msh", **headers: str) -> Any:
-    headers = {"Content-Type": "application/octet-stream", **headers}
-    return client.post("/v1/files", params={"name": name}, content=content, headers=headers)
 
 
 def with_mesh(path: str) -> Tree:

@@ -6,79 +6,20 @@ import re
 import signal
 import sqlite3
 import subprocess
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+import time
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from serving import stand_in
+from commands import CASE, SWEEP, WAIT, command, frit, serving, typed
 from soak import of_data
-
-CASE = """
-name = "sleep 0"
-domain = { size = [22.0, 13.0] }
-nodes = { source = "triangular", spacing = 1.0 }
-particles = { centres = [[6.5, 6.2], [15.4, 6.8]], radii = [5.0, 4.0] }
-time = { end = 0.01 }
-"""
-TABLES = re.sub(r"(?m)^(domain|nodes|particles|time|name) =", r"base.\1 =", CASE)
-SWEEP = f"""
-name = "%s"
-{TABLES}
-[axes]
-"model.D_surf" = [2.0, 4.0, 6.0]
-"""
-WAIT = 120.0  # seconds; for hangs alone
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder in which jobs do what their names say."""
-    monkeypatch.setenv("FRIT_MPIRUN", stand_in(tmp_path))
-    monkeypatch.delenv("FRIT_TOKEN", raising=False)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "case.toml").write_text(CASE)
-    (tmp_path / "long.toml").write_text(CASE.replace("sleep 0", "sleep 60").replace("15.4", "15.5"))
-    return tmp_path
-
-
-def command(*words: str) -> list[str]:
-    return [sys.executable, "-P", "-c", "from frit.service.cli.main import main; main()", *words]
-
-
-def frit(*words: str, status: int = 0) -> str:
-    """What a command prints; its exit status must be the one that is expected."""
-    done = subprocess.run(command(*words), capture_output=True, text=True, timeout=WAIT, check=False)
-    assert done.returncode == status, done.stdout + done.stderr
-    return done.stdout if status == 0 else done.stdout + done.stderr
-
-
-@contextmanager
-def serving(folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """`frit serve` on a free port, which FRIT_URL then names."""
-    log = folder / "serve.log"
-    with open(log, "w") as out:
-        process = subprocess.Popen(
-            command("serve", "--data", "data", "--cores", "2", "--port", "0", *words), stdout=out, stderr=out, text=True
-        )
-    try:
-        while (found := re.search(r"running on (http://\S+)", log.read_text())) is None:
-            assert process.poll() is None, log.read_text()
-        os.environ["FRIT_URL"] = found[1]
-        yield process
-    finally:
-        os.environ.pop("FRIT_URL", None)
-        process.send_signal(signal.SIGINT)
-        process.wait(WAIT)
-        for left in of_data(folder / "data"):
-            left.kill()
 
 
 def test_submit_look_cancel_retry(folder: Path) -> None:
     with serving(folder):
-        done = frit("submit", "case.toml", "--wait", "--tag", "first", "--name", "sleep 0.1")
+        done = typed("submit", "case.toml", "--wait", "--tag", "first", "--name", "sleep 0.1")
         identifier = done.split()[0]
         assert "succeeded" in done
         (row,) = json.loads(frit("jobs", "tag=first", "--json"))
@@ -103,7 +44,7 @@ def test_what_is_refused(folder: Path) -> None:
         assert "none" in frit("show", "nothing", status=2)
         assert "particles.mean_radius" in frit("jobs", "particles.mean_radio.ge=3", status=2)
         assert "must be KEY=VALUE" in frit("jobs", "running", status=2)
-        assert "in use by process" in frit("serve", "--data", "data", "--port", "0", status=2)
+        assert "in use by process" in typed("serve", "--data", "data", "--port", "0", status=2)
         assert "in use by process" in frit("sweep", "run", sweep(folder, "sleep 0"), "--data", "data", status=2)
     assert "no service answers" in frit("jobs", "--url", "http://127.0.0.1:9", status=1)
     assert "access token" in frit("serve", "--data", "data", "--host", "0.0.0.0", "--port", "0", status=2)
@@ -179,6 +120,7 @@ def test_ctrl_c_writes_checkpoints_and_the_same_command_goes_on(folder: Path) ->
     process = subprocess.Popen(command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while len(list((folder / "data").glob("runs/*/calls"))) < 2:
         assert process.poll() is None
+        time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=WAIT)
     assert (process.returncode, "the same command goes on" in said) == (130, True)
@@ -191,7 +133,7 @@ def test_ctrl_c_writes_checkpoints_and_the_same_command_goes_on(folder: Path) ->
 
 def test_a_failed_point_is_told_and_does_not_stop_the_others(folder: Path) -> None:
     file = Path(sweep(folder, "says-no 1"))
-    said = frit("sweep", "run", str(file), "--data", "data", status=1)
+    said = typed("sweep", "run", str(file), "--data", "data", status=1)
     assert said.count("failed") >= 3
     assert "fields left [-0.5, 1.5]" in said
 

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
-from test_server_commands import frit, serving
+from commands import frit, serving
 
 from frit.service.client import Client
 from frit.sweeps import open_results

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
-from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
-from indexing import done, is_whole, new, opened, rows
+from indexing import done, is_whole, new, opened, rows, use
+from places import DATA, SUPPORT
 from typer.testing import CliRunner
 
 from frit.service.cli import main as cli
@@ -31,7 +31,7 @@ from frit.solver.revision import FIRST
 
 NEWEST = migrations.versions(Path("there is none"))[1]
 
-OLD = Path(__file__).parent / "data" / "index-0001.sql"
+OLD = DATA / "index-0001.sql"
 PROCESS = {"pid": "pid", "start": "pid_start", "boot": "boot"}
 TABLES = ["sweeps", "jobs", "sweep_jobs", "attempts", "history", "snapshots", "events", "tokens", "idempotency"]
 
@@ -186,7 +186,7 @@ KILLED = "os.kill(os.getpid(), signal.SIGKILL)"
 CHILD = """
 import sys
 from pathlib import Path
-from test_migrations import use
+from indexing import use
 from frit.service.index import migrations
 use(Path(sys.argv[2]))
 migrations.upgrade(Path(sys.argv[1]))
@@ -198,18 +198,6 @@ def scripts(folder: Path, end: str) -> Path:
     shutil.copytree(Path(migrations.__file__).parent, folder, ignore=shutil.ignore_patterns("__pycache__"))
     (folder / "versions" / "9998_bad.py").write_text(BAD.replace("%s", NEWEST).replace("{end}", end))
     return folder
-
-
-def use(folder: Path) -> None:
-    """Let frit take its migrations from a folder."""
-    plain = migrations.configuration
-
-    def configuration(path: Path) -> Config:
-        config = plain(path)
-        config.set_main_option("script_location", str(folder))
-        return config
-
-    migrations.configuration = configuration
 
 
 @pytest.fixture
@@ -236,7 +224,7 @@ def test_an_upgrade_that_is_killed_changes_nothing(old: Path, tmp_path_factory: 
     before = content(path)
     folder = scripts(tmp_path_factory.mktemp("scripts") / "m", KILLED)
     command = [sys.executable, "-c", CHILD, str(path), str(folder)]
-    killed = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    killed = subprocess.run(command, cwd=SUPPORT, capture_output=True, text=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert (version(path), content(path)) == ("0001", before)
     migrations.upgrade(path)  # by the real ones
@@ -311,7 +299,7 @@ def test_two_that_open_at_once_make_one_good_index(tmp_path: Path) -> None:
         children = [
             subprocess.Popen(
                 [sys.executable, "-c", OPEN, str(folder), str(k)],
-                cwd=Path(__file__).parent, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                cwd=SUPPORT, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             )
             for k in range(2)
         ]  # fmt: skip

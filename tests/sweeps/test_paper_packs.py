@@ -6,10 +6,10 @@ neighbours, and the nodal fields (34) are the same; meshes of two spacings show 
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from frit.solver.case import Case, Nodes, ShapeFunctions, load_case
 from frit.solver.geometry import make_mesh
@@ -20,7 +20,7 @@ from frit.solver.partition import Ranks
 from frit.solver.prepare import prepare
 from frit.solver.setup import make_setup
 
-FOLDER = Path(__file__).parent.parent / "sweeps/paper"
+FOLDER = ROOT / "sweeps/paper"
 # count, initial vacancy ratio
 PACKS = {"pack_a": (143, 0.351), "pack_b": (150, 0.350), "pack_c": (134, 0.277), "pack_d": (85, 0.621)}
 

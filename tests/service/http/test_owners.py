@@ -9,8 +9,8 @@ import pytest
 from asking import TINY, service
 from booths import Booths
 from fastapi.testclient import TestClient
+from requesting import SWEEP, case, kind, upload
 from serving import ended, in_state, new_job, settings, submit, until
-from test_verbs import SWEEP, case, kind, upload
 
 from frit.service.index import tokens
 from frit.service.jobs.engine import Engine

@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 from asking import PACKING, TINY, Tree, service
-from test_case import altered
+from cases import altered
+from places import ROOT
 
 from frit.service.http.admission import job_of, sweep_of
 from frit.service.http.problems import HttpError
@@ -18,7 +19,6 @@ from frit.solver.partition import Ranks
 from frit.solver.prepare import build_mesh
 from frit.sweeps.cost import nodes_in_range
 
-ROOT = Path(__file__).parent.parent
 ROOMY: dict[str, Any] = {"cores": 2, "memory_limit": 12_000_000_000}
 MODEST = Settings(**ROOMY)
 

@@ -8,6 +8,9 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from alembic.config import Config
+
+from frit.service.index import migrations
 from frit.service.index.records import NewPoint
 from frit.service.index.store import Store
 from frit.service.jobs.states import Exit, Job, Move, NewJob
@@ -81,3 +84,15 @@ def is_whole(path: Path) -> bool:
 def lines(path: Path) -> list[dict[str, Any]]:
     """Of the journal; every one must be whole."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def use(folder: Path) -> None:
+    """Let frit take its migrations from a folder."""
+    plain = migrations.configuration
+
+    def configuration(path: Path) -> Config:
+        config = plain(path)
+        config.set_main_option("script_location", str(folder))
+        return config
+
+    migrations.configuration = configuration

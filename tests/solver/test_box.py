@@ -9,10 +9,10 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+from boxes import boxes as ordinary_boxes
 from launching import Case, columns, solve
 from reference import mean_in_box
 from scipy.spatial import Delaunay
-from test_observe import boxes as ordinary_boxes
 
 from frit.solver.arrays import Floats
 from frit.solver.box import box_weights

@@ -17,7 +17,7 @@ from launching import PAIR, history, snapshots, solve
 from frit.solver import CaseError, Moment, SimulationError, load_case, measure, simulate
 from frit.solver.door import looks
 
-README = Path(__file__).parents[1] / "solver/README.md"
+README = Path(__file__).parents[2] / "solver/README.md"
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", README.read_text(), re.M | re.S)
 SHORT: dict[str, Any] = PAIR | {"time": {"end": 0.1}, "output": {"history_every": 0.02, "snapshots": [0.0, 0.05, 0.1]}}
 

@@ -196,6 +196,8 @@ class Recorder:
         self.snapshots = output.Snapshots(directory, case, setup.positions, self.collector, fresh)
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
         self.latest: dict[str, Any] = {}  # history row
+        ends = self.rows.vacancy_ratios() if self.rows is not None else None
+        self.ratios: tuple[float, float] | None = self.ranks.from_root(ends)  # vacancy: of the first and the last row
         self.noted = False  # that a particle is pressed against a wall
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
 
@@ -207,6 +209,8 @@ class Recorder:
                 record_note(self.directory, note)
         row = self.observables.row(system, state, u, time_, self._wall_time())
         self.latest = row
+        ratio = row["vacancy_ratio"]
+        self.ratios = (ratio if self.ratios is None else self.ratios[0], ratio)
         if self.rows is not None:
             self.rows.append(row)
 
@@ -221,14 +225,26 @@ class Recorder:
         self.snapshot(self.snapshots.next(state.time), system, state, u, state.time)
 
     def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
-        """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
+        """A row where the vacancy ratio has moved; a checkpoint when it is time or somebody asks; True when somebody
+        asks for the end.
+        """
         due = time.monotonic() - self.checkpoint_clock >= system.case.output.checkpoint_every
-        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
-        due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
+        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end, self._moved(system, state)]
+        due, asked, stop, moved = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
+        if moved:
+            self.history(system, state, system.at(state, integrator.y), state.time)
         self._show(system, state)
         if (due or asked) and not stop:
             self.checkpoint(system, state, integrator)
         return bool(stop)
+
+    def _moved(self, system: System, state: Progress) -> bool:
+        """Whether the vacancy ratio is `output.history_change` of its first value away from that of the last row."""
+        change = system.case.output.history_change
+        if not change or not state.step or self.ratios is None:
+            return False
+        first, last = self.ratios
+        return first > 0.0 and abs(self.observables.vacancy_ratio(state) - last) >= change * first
 
     def checkpoint(self, system: System, state: Progress, integrator: Integrator) -> None:
         """Make the state durable, and the rows before it."""

@@ -78,6 +78,11 @@ class History:
             return []
         return [line for line in self.path.read_text().splitlines(keepends=True) if line.endswith("\n")]
 
+    def vacancy_ratios(self) -> tuple[float, float] | None:
+        """Of the first and the last row, where there is one."""
+        rows = [json.loads(line)["vacancy_ratio"] for line in self._lines()]
+        return (rows[0], rows[-1]) if rows else None
+
     def append(self, row: dict[str, Any]) -> None:
         """Add a row."""
         self.file.write(json.dumps(row, allow_nan=False) + "\n")

@@ -31,7 +31,7 @@ main()
 # Long enough to be interrupted wherever it runs; nobody waits for its end.
 ENDLESS = {
     "time": {"integrator": "rk2", "end": 1000.0, "step": 1e-4},
-    "output": {"history_every": 0.001, "snapshots": [0.0, 1000.0]},
+    "output": {"history_every": 0.001, "history_change": 0, "snapshots": [0.0, 1000.0]},
 }
 SHOWN = re.compile(r"t [\d.e-]+/1000 step \d+ [\d.e+]+ ev/s live \d+% vacancy 0\.\d{4} [\d:, a-z]+ left")
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from frit.solver.arrays import Floats
 from frit.sweeps import curves, plots
 from frit.sweeps.plots import PlotError
+from frit.sweeps.ranking import Outcome, rank
 
 SIZE = [60.0, 36.0]
 CENTRES = np.array([[18.0, 18.0], [42.0, 18.0]])
@@ -184,9 +185,9 @@ def test_missing_or_empty_snapshots_are_named(tmp_path: Path) -> None:
 def test_a_name_is_never_a_formula_nor_a_page(tmp_path: Path) -> None:
     """Names come from whoever submits."""
     names = [r"$\frac{", "</script><script>alert(1)</script>", "_hidden", "$x$"]
-    made = [curves.Curve(name, {}, [0.0, 1.0], [0.3, 0.2]) for name in names]
-    curves.write(tmp_path / "a.png", "vacancy_ratio", made)
-    curves.write(tmp_path / "a.html", "vacancy_ratio", made)
+    made = [Outcome(name, name, "succeeded", {"a.b": name}, [0.0, 1.0], [0.3, 0.2]) for name in names]
+    curves.write(tmp_path / "a.png", "vacancy_ratio", rank(made))
+    curves.write(tmp_path / "a.html", "vacancy_ratio", rank(made))
     assert "alert(1)</script>" not in (tmp_path / "a.html").read_text()
 
 

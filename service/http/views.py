@@ -253,7 +253,8 @@ class SweepPage(BaseModel):
 class Curve(BaseModel):
     """An observable of one job over model time. `parameters`: those that differ within the sweep.
 
-    `older`: the revision of the solver that computed it, where it is not the present one's.
+    `older`: the revision of the solver that computed it, where it is not the present one's; `pack_porosity`: of the
+    pack's own box, at the end.
     """
 
     job: str
@@ -264,6 +265,8 @@ class Curve(BaseModel):
     values: list[float | None]
     final: float | None
     older: int | None
+    message: str | None
+    pack_porosity: float | None
 
 
 class Comparison(BaseModel):

@@ -7,7 +7,7 @@ import sqlalchemy as sa
 
 from ..jobs.states import older_revision
 from .reading import Reading
-from .records import MADE_BY, OLD_CASE, Compared, SweepPoint, SweepRecord, find_sweep, record
+from .records import MADE_BY, OLD_CASE, POROSITY, Compared, SweepPoint, SweepRecord, find_sweep, record
 from .schema import history, jobs, sweep_jobs, sweeps
 
 
@@ -64,15 +64,15 @@ class SweepQueries(Reading):
         """The jobs of a sweep (by seq), in its own order, from that point on."""
         query = (
             sa.select(jobs.c.seq, jobs.c.id, sweep_jobs.c.name, jobs.c.state, sweep_jobs.c.parameters)
-            .add_columns(MADE_BY, OLD_CASE)
+            .add_columns(MADE_BY, OLD_CASE, jobs.c.message, POROSITY)
             .join_from(sweep_jobs, jobs).where(sweep_jobs.c.sweep == sweep).order_by(sweep_jobs.c.position)
             .offset(after).limit(limit)
         )  # fmt: skip
         with self.reading() as connection:
             rows = connection.execute(query).all()
         return [
-            Compared(seq, identifier, name, state, parameters, older_revision(revision, case))
-            for seq, identifier, name, state, parameters, revision, case in rows
+            Compared(seq, identifier, name, state, parameters, older_revision(revision, case), message, porosity)
+            for seq, identifier, name, state, parameters, revision, case, message, porosity in rows
         ]
 
     def differing(self, sweep: int) -> list[str]:

@@ -25,7 +25,7 @@ run: setup
 pack: setup
 	@if [ -e "$(OUT)/run.json" ]; then \
 	  case "$$(sed -n 's/.*"state": "\([a-z]*\)".*/\1/p' "$(OUT)/run.json")" in \
-	    done) echo "$(OUT) is done already; make clean removes it" ;; \
+	    done|succeeded) echo "$(OUT) is done already; make clean removes it" ;; \
 	    *) $(BIN)/frit resume "$(OUT)" ;; \
 	  esac; \
 	else $(BIN)/frit run "$(CASE)" --ranks $(RANKS) --out "$(OUT)"; fi

@@ -2,7 +2,7 @@
 anew where it was killed before its first checkpoint.
 
 Signals: USR1 writes a checkpoint, TERM and INT write one and end the run. The end is told by run.json (`state`:
-running, done, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
+running, succeeded, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from . import checkpoint, output
 from .arrays import Floats
 from .case import Case, CaseError, load_case
 from .checkpoint import CheckpointError
+from .ended import SUCCEEDED, read_run
 from .failure import comes_again, told
 from .geometry import MeshError
 from .integrators import Integrator
@@ -41,7 +42,7 @@ PROGRESS_EVERY = 0.25  # seconds between two progress lines
 SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
 ANEW = "it was stopped before its first checkpoint: begun anew from case.json"
 MIXED = "begun by revision {before} of the solver, gone on with by revision {now}: it counts as of the older one"
-EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
+EXIT_STATUS = {SUCCEEDED: 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
 def main() -> int:
@@ -56,6 +57,8 @@ def main() -> int:
     profile = [entry[0] for entry in ranks.everyones(np.array([ranks.watch.read()], dtype=object))]
     if ranks.root:
         record_end(directory, state, message, profile=profile)
+        if state == SUCCEEDED:
+            clear(directory)
     return EXIT_STATUS[state]
 
 
@@ -120,7 +123,8 @@ def execute(
         recorder = Recorder(directory, setup, scheme, state, identity, wall_time, requests, arguments.progress)
         try:
             ending = run(scheme, state, integrator, recorder)
-            recorder.checkpoint(scheme, state, integrator)
+            if ending is not Ending.DONE or case.output.keep_checkpoint:
+                recorder.checkpoint(scheme, state, integrator)
         except (RunError, FloatingPointError) as error:
             recorder.keep(scheme, state)
             checkpoint_time = f"the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
@@ -128,7 +132,7 @@ def execute(
         finally:
             recorder.close()
         if ending is Ending.DONE:
-            return "done", None
+            return SUCCEEDED, None
         if ending is Ending.STOPPED:
             return "interrupted", f"checkpoint at t = {state.time:.6g}"
         del scheme, state, recorder  # the mesh is divided anew: the run goes on from the checkpoint
@@ -164,6 +168,8 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> tuple[Case
     if resumed and not (kept or path.exists()):
         raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from, and no {path.name} to begin with")
     output.remove_torn(directory)
+    if resumed and not kept and read_run(directory).get("state") == SUCCEEDED:
+        raise output.DirectoryError(f"{directory}: has come to its end already; there is nothing to go on with")
     if resumed:
         return load_case(path), not kept
     case = load_case(arguments.case)
@@ -329,6 +335,13 @@ def record_end(
     add_to_log(directory, f"{state}{': ' + message if message else ''}")
     if message:
         print(f"{state}: {message}", file=sys.stderr, flush=True)
+
+
+def clear(directory: Path) -> None:
+    """After the end of the case: nothing goes on from the checkpoint, and nobody needs the lock."""
+    if not load_case(directory / "case.json").output.keep_checkpoint:
+        (directory / checkpoint.NAME).unlink(missing_ok=True)
+    (directory / output.LOCK).unlink(missing_ok=True)
 
 
 def record_note(directory: Path, note: str) -> None:

@@ -533,10 +533,12 @@ class Output(Table):
     particles, shrunk to 80 % about its centre)"""
     checkpoint_every: Positive = 60.0
     """wall-clock seconds between checkpoints"""
+    keep_checkpoint: Flag = False
+    """whether the last one stays when the run has come to its end"""
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """How often a checkpoint is written changes nothing."""
-        return {key: value for key, value in super().essence(tree).items() if key != "checkpoint_every"}
+        """Checkpoints change nothing."""
+        return {key: value for key, value in super().essence(tree).items() if "checkpoint" not in key}
 
     def snapshot_count(self, end: float) -> float:
         """How many snapshots a run to `end` writes, reckoned without making them."""

@@ -25,6 +25,7 @@ class DirectoryError(ValueError):
     """A run directory that cannot be used; the message says why."""
 
 
+LOCK = "lock"
 OWN = ("case.json", "checkpoint.h5", "history.jsonl", "particles.csv", "run.json")  # files that the solver replaces
 
 
@@ -52,12 +53,18 @@ def now() -> str:
 
 def lock(directory: Path) -> None:
     """Hold the run directory until this process ends; DirectoryError where another one holds it."""
-    handle = os.open(directory / "lock", os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    while True:
+        handle = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(handle), os.stat(directory / LOCK)):
+                return
+        except FileNotFoundError:
+            pass  # a run that came to its end has just removed it
+        except OSError as error:
+            os.close(handle)
+            raise DirectoryError(f"{directory}: another process is running here") from error
         os.close(handle)
-        raise DirectoryError(f"{directory}: another process is running here") from error
 
 
 class History:

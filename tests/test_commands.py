@@ -105,7 +105,7 @@ def test_run_ends_with_a_summary_and_nothing_else(folder: Path) -> None:
     rows = history(folder / "runs/pair")
     said = (folder / "said").read_text()
     words = dict(line.split(maxsplit=1) for line in said.splitlines())
-    assert (words["state"], words["steps"], words["evaluations"]) == ("done", "100", "200")
+    assert (words["state"], words["steps"], words["evaluations"]) == ("succeeded", "100", "200")
     assert words["directory"] == "runs/pair"
     assert said.count(f"{rows[0]['vacancy_ratio']:.6g} -> {rows[-1]['vacancy_ratio']:.6g}") == 1
     assert "\x1b" not in said
@@ -201,7 +201,7 @@ def test_resume_ends_like_an_undisturbed_run(folder: Path) -> None:
     status, out, err = frit(folder, "resume", "cut", "--json")
     assert (status, err) == (0, "")
     assert {key: json.loads(out)[key] for key in ("state", "steps", "directory")} == {
-        "state": "done",
+        "state": "succeeded",
         "steps": 100,
         "directory": "cut",
     }

@@ -208,6 +208,19 @@ class JobPage(BaseModel):
     next: str | None
 
 
+class History(BaseModel):
+    """Rows of a job's history, as the solver wrote them."""
+
+    job: str
+    rows: list[dict[str, Any]]
+
+
+class Histories(BaseModel):
+    """Histories of several jobs."""
+
+    histories: list[History]
+
+
 class SnapshotView(BaseModel):
     """A complete snapshot: its place along the arrays' first axis, and its model time."""
 

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from concurrent.futures import Future
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -9,6 +10,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.responses import StreamingResponse
 
 from ..index.records import NotFoundError
+from ..jobs.states import Job, NewJob
 from . import admission, delivery, filters, openapi, shown, stream, views
 from .asking import (
     GivenKey,
@@ -43,7 +45,15 @@ api = APIRouter(prefix="/v1", route_class=LimitedRoute)
 async def submit_job(
     submission: views.JobSubmission, request: Request, who: Submitter, given: GivenKey = None
 ) -> Response:
-    """Queue a case. Every request makes a job, also of a case that was run before; see Idempotency-Key."""
+    """Queue a case. Every request makes a job, also of a case that was run before, unless `reuse` is true: then the job
+    that there is of the case is the answer, tried again where it was cancelled or lost. See Idempotency-Key.
+    """
+
+    def queued(new: NewJob) -> "Future[Job]":
+        if not submission.reuse:
+            return engine.store.submit(new, key)
+        return engine.store.reuse(new, key, not engine.settings.private, submission.recompute)
+
     engine, rooms = running(request), rooms_of(request)
     key = await key_of_body(given, who, "POST /v1/jobs", submission)
     if key is not None and (before := engine.store.known(key)) is not None:
@@ -52,12 +62,12 @@ async def submit_job(
         if declared(request) < SMALL and not admission.needs_files(submission.case, submission.files):
             new = admission.job_of(submission, engine.settings, owner=who.label)
             rooms.quotas.admit(who, 1, new.ranks)
-            job = await asyncio.wrap_future(engine.store.submit(new, key))
+            job = await asyncio.wrap_future(queued(new))
         else:
             async with admission.taken(submission.case, submission.files, "/case", rooms, who) as uploads:
                 new = await asyncio.to_thread(admission.job_of, submission, engine.settings, uploads, who.label)
                 rooms.quotas.admit(who, 1, new.ranks)
-                job = await asyncio.wrap_future(engine.store.submit(new, key))
+                job = await asyncio.wrap_future(queued(new))
     return made(job_view(engine, job), f"/v1/jobs/{job.id}")
 
 

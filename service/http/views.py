@@ -70,6 +70,8 @@ class JobSubmission(Body):
     tags: Tags = []
     time_limit: Limit | None = None
     files: Files = {}
+    reuse: Annotated[bool, Field(strict=True, description="Take the job that there is of this case, if any.")] = False
+    recompute: Annotated[bool, Field(strict=True, description="With reuse: not what an older solver computed.")] = False
 
 
 class SweepSubmission(Body):

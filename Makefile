@@ -30,8 +30,7 @@ pack: setup
 	  esac; \
 	else $(BIN)/frit run "$(CASE)" --ranks $(RANKS) --out "$(OUT)"; fi
 	$(BIN)/frit plot "$(OUT)" --out "$(OUT)/history.png"
-	$(BIN)/frit plot "$(OUT)" --time 0 --out "$(OUT)/start.png"
-	$(BIN)/frit plot "$(OUT)" --time 1e9 --out "$(OUT)/end.png"
+	$(BIN)/frit plot "$(OUT)" --panel 0,end --out "$(OUT)/before-and-after.png"
 
 test: setup
 	$(BIN)/python -m pytest -n 2

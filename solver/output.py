@@ -173,13 +173,16 @@ def fields_of(values: Floats, owner: Numbers) -> Fields:
 
 
 def create_group(path: Path, case: Case, positions: Floats, block: int) -> None:
-    """An empty group with the positions of the nodes."""
+    """An empty group with the positions of the nodes. Fields are kept in 32 bits: 1e-7 of their largest value."""
     import zarr
+    from zarr.codecs import BloscCodec, BloscShuffle
 
+    packed = BloscCodec(cname="zstd", clevel=5, shuffle=BloscShuffle.shuffle)
     group = zarr.open_group(path, mode="w", zarr_format=3, attributes=ATTRIBUTES | {"name": case.name})
     count, dim = positions.shape
     nodes = group.create_array(
         "nodes", shape=(count, dim), chunks=(block, dim), dtype="float64", dimension_names=("node", "axis"),
+        compressors=packed,
         attributes={"units": "nm", "long_name": "position of the node"},
     )  # fmt: skip
     nodes[:] = positions
@@ -188,13 +191,14 @@ def create_group(path: Path, case: Case, positions: Floats, block: int) -> None:
         attributes={"units": "1", "long_name": "model time"}, fill_value=np.nan,
     )  # fmt: skip
     described = {
-        "rho": ("float64", np.nan, "concentration: 1 solid, 0 vacancy"),
-        "eta_squared": ("float64", np.nan, "sum of the squared order parameters"),
+        "rho": ("float32", np.nan, "concentration: 1 solid, 0 vacancy"),
+        "eta_squared": ("float32", np.nan, "sum of the squared order parameters"),
         "particle": ("int32", -1, "number of the particle that owns the node, -1: vacancy"),
     }
     for name, (kind, fill, words) in described.items():
         group.create_array(
             name, shape=(0, count), chunks=(1, block), dtype=kind, dimension_names=("time", "node"),
+            compressors=packed,
             attributes={"units": "1", "long_name": words}, fill_value=fill,
         )  # fmt: skip
     consolidate(path)

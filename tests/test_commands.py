@@ -51,6 +51,7 @@ step = 1e-4
 [output]
 history_every = 0.001
 snapshots = [0.0, 0.0035, 0.01]
+keep_checkpoint = true
 """
 
 

@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from frit.solver.ended import SUCCEEDED, read_run
 
 from ..jobs.launch import Launch, LaunchError, Outcome
-from . import compare, index, jobs, serve, service, sweep, token
+from . import compare, index, jobs, pictures, serve, service, sweep, token
 from .terminal import AsJson, cell, in_words, refuse
 
 EXIT = {SUCCEEDED: 0, "failed": 1, "refused": 2, "interrupted": 130}
@@ -120,34 +120,8 @@ def resume(
     follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
 
 
-@app.command()
-def plot(
-    directory: RunDirectory,
-    time: Annotated[
-        float | None, typer.Option(metavar="T", help="Model time; the nearest snapshot is shown.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: in DIR; .pdf, .svg too.")
-    ] = None,
-) -> None:
-    """Picture of the snapshot nearest to --time; of the history without it."""
-    from frit.sweeps import plots
-
-    try:
-        if time is None:
-            out = out or directory / "history.png"
-            plots.plot_history(directory, out)
-            typer.echo(f"{out}: history")
-        else:
-            time = plots.nearest_time(directory, time)
-            out = out or directory / f"snapshot-{time:g}.png"
-            plots.plot_snapshot(directory, time, out)
-            typer.echo(f"{out}: snapshot at t = {time:g}")
-    except (ValueError, OSError) as error:
-        refuse(str(error))
-
-
-for command in (serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
+for command in (pictures.plot, pictures.movie,
+                serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
                 jobs.change, jobs.gc, compare.compare, service.plan, service.limits, service.events):  # fmt: skip
     app.command()(command)
 app.command("rm")(jobs.remove)

@@ -21,6 +21,7 @@ PALE = np.array([0.86, 0.86, 0.84])  # of grains where their boundaries are what
 NONE = np.array([0.87, 0.87, 0.87])
 SCALES = {"radius": "radius at the start (nm)", "rho": "concentration"}
 MOST_PANELS = 12
+SMALL = 0.6  # of the pixels of a picture that stands alone: for panels and frames
 FRAMES = 10  # of a movie, in a second
 
 
@@ -35,7 +36,8 @@ class Look(NamedTuple):
 class Scene:
     """What all snapshots of a run have in common: sizes, colours, the box."""
 
-    def __init__(self, directory: Path, look: Look) -> None:
+    def __init__(self, directory: Path, look: Look, fineness: float = 1.0) -> None:
+        """fineness: see `plots.Section`."""
         self.directory, self.look, self.case = directory, look, plots.read_case(directory)
         self.size = np.asarray(self.case["domain"]["size"], float)
         self.box = (self.case.get("output") or {}).get("vacancy_box")
@@ -43,6 +45,7 @@ class Scene:
         last = max(int(first.owner.max(initial=0)), int(first.first_owner.max(initial=0)))
         self.radii = radii_of(first, self.size, last + 1)
         self.colours = self._colours(first, last)
+        self.fineness = fineness
         self.cuts: dict[tuple[int, int], plots.Section] = {}
 
     def _colours(self, first: Snapshot, last: int) -> Floats:
@@ -87,7 +90,7 @@ class Scene:
     def _section(self, ax: "Axes", snapshot: Snapshot, plane: tuple[int, int]) -> None:
         (i, j), names = plane, "xyz"
         if plane not in self.cuts:
-            self.cuts[plane] = plots.Section(snapshot.nodes, self.size, plane)
+            self.cuts[plane] = plots.Section(snapshot.nodes, self.size, plane, self.fineness)
         cut = self.cuts[plane]
         rho, picture = cut.shown(snapshot, self.colours)
         shown: Any = {"X": picture} if self.look.colour != "rho" else {"X": rho, "cmap": "magma", "vmin": 0, "vmax": 1}
@@ -129,8 +132,8 @@ def draw_panels(directory: Path, times: Sequence[float], out: Path, look: Look =
     """Draw the snapshots nearest to these times beside each other; returns their times."""
     if len(times) > MOST_PANELS:
         raise PlotError(f"{len(times)} snapshots in one figure: must be at most {MOST_PANELS}")
-    scene = Scene(directory, look)
     found = list(dict.fromkeys(plots.nearest_time(directory, time) for time in times))
+    scene = Scene(directory, look, 1.0 if len(found) == 1 else SMALL)
     figure, panels = _laid_out(scene, len(found))
     for axes, time in zip(panels, found, strict=True):
         scene.draw(axes, plots.read_snapshot(directory, time))
@@ -172,7 +175,7 @@ def movie(directory: Path, out: Path | None, look: Look = Look(), frames: int = 
     out = out or directory / ("movie.mp4" if can else "movie.gif")
     if out.suffix != ".gif" and not can:
         raise PlotError(f"{out}: without ffmpeg a movie must end in .gif")
-    scene, times = Scene(directory, look), plots.snapshot_times(directory)
+    scene, times = Scene(directory, look, SMALL), plots.snapshot_times(directory)
     figure, [axes] = _laid_out(scene, 1)
     figure.set_dpi(110)
     scene.bar(figure, axes)

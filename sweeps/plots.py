@@ -185,10 +185,11 @@ def thinned(nodes: Floats) -> Array:
 class Section:
     """A plane through the domain, in 3-D through its middle: its pixels, and which nodes they are interpolated from."""
 
-    def __init__(self, nodes: Floats, size: Floats, plane: tuple[int, int]) -> None:
+    def __init__(self, nodes: Floats, size: Floats, plane: tuple[int, int], fineness: float = 1.0) -> None:
+        """fineness: times the pixels of a picture that stands alone."""
         from scipy.spatial import cKDTree
 
-        pitch = size.max() / PIXELS[len(size)]
+        pitch = size.max() / (fineness * PIXELS[len(size)])
         self.x, self.y = (np.linspace(0, size[k], round(size[k] / pitch)) for k in plane)
         at = np.tile(size / 2, (len(self.x) * len(self.y), 1))
         at[:, plane] = np.stack(np.meshgrid(self.x, self.y), axis=-1).reshape(-1, 2)

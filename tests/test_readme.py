@@ -11,6 +11,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -149,7 +150,10 @@ def test_the_scripts_run(folder: Path, file: str, monkeypatch: pytest.MonkeyPatc
     assert codes
     with listening(folder / "served", free_disk=0) as url:
         for code in codes:
-            exec(compile(code.replace("http://127.0.0.1:8000", url), file, "exec"), {})
+            names: dict[str, Any] = {}
+            exec(compile(code.replace("http://127.0.0.1:8000", url), file, "exec"), names)
+            if "c" in names:
+                names["c"].close()
 
 
 def test_examples_of_the_interface_are_cases() -> None:

@@ -25,13 +25,12 @@ run: setup
 pack: setup
 	@if [ -e "$(OUT)/run.json" ]; then \
 	  case "$$(sed -n 's/.*"state": "\([a-z]*\)".*/\1/p' "$(OUT)/run.json")" in \
-	    done) echo "$(OUT) is done already; make clean removes it" ;; \
+	    done|succeeded) echo "$(OUT) is done already; make clean removes it" ;; \
 	    *) $(BIN)/frit resume "$(OUT)" ;; \
 	  esac; \
 	else $(BIN)/frit run "$(CASE)" --ranks $(RANKS) --out "$(OUT)"; fi
 	$(BIN)/frit plot "$(OUT)" --out "$(OUT)/history.png"
-	$(BIN)/frit plot "$(OUT)" --time 0 --out "$(OUT)/start.png"
-	$(BIN)/frit plot "$(OUT)" --time 1e9 --out "$(OUT)/end.png"
+	$(BIN)/frit plot "$(OUT)" --panel 0,end --out "$(OUT)/before-and-after.png"
 
 test: setup
 	$(BIN)/python -m pytest -n 2

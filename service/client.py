@@ -77,21 +77,23 @@ class Client:
     def submit(
         self, what: str | Path | Mapping[str, Any], *, ranks: int | None = None, name: str | None = None,
         priority: int | None = None, tags: Sequence[str] | None = None, time_limit: float | None = None,
-        recompute: bool = False,
+        recompute: bool = False, reuse: bool = False,
     ) -> RemoteJob | RemoteSweep:  # fmt: skip
         """Submit a case, or a sweep, which has a base: a TOML or JSON file, or a tree of plain values.
 
-        Mesh and particle files that it names are read here and sent along. time_limit: wall-clock seconds. recompute:
-        of a sweep also what an older revision of the solver computed; a case is computed at any rate.
+        Mesh and particle files that it names are read here and sent along. time_limit: wall-clock seconds. reuse: of a
+        case, take the job that there is, if any (points of a sweep always do). recompute: not one that an older
+        revision of the solver computed.
         Raises `CaseError` for what is wrong here already, `ProblemError` for what the service refuses.
         """
         kind, tree, files = self._sendable(what)
         options: Tree = {"ranks": ranks, "name": name, "priority": priority, "time_limit": time_limit}
         given = {key: value for key, value in options.items() if value is not None}
         given |= {} if tags is None else {"tags": list(tags)}
+        given |= {"recompute": True} if recompute else {}
         if kind == "definition":
-            given |= {"recompute": True} if recompute else {}
             return RemoteSweep(self, self.post("/v1/sweeps", {"definition": tree, "files": files, **given}))
+        given |= {"reuse": True} if reuse else {}
         return RemoteJob(self, self.post("/v1/jobs", {"case": tree, "files": files, **given}))
 
     def _sendable(self, what: str | Path | Mapping[str, Any]) -> tuple[str, Tree, Tree]:

@@ -2,7 +2,7 @@
 anew where it was killed before its first checkpoint.
 
 Signals: USR1 writes a checkpoint, TERM and INT write one and end the run. The end is told by run.json (`state`:
-running, done, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
+running, succeeded, failed, interrupted, refused), because MPI libraries differ in the exit codes they pass on.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from . import checkpoint, output
 from .arrays import Floats
 from .case import Case, CaseError, load_case
 from .checkpoint import CheckpointError
+from .ended import SUCCEEDED, read_run
 from .failure import comes_again, told
 from .geometry import MeshError
 from .integrators import Integrator
@@ -41,7 +42,7 @@ PROGRESS_EVERY = 0.25  # seconds between two progress lines
 SPOKEN = 0.2  # seconds before an abort in which mpirun passes on what was said: some lose the last lines
 ANEW = "it was stopped before its first checkpoint: begun anew from case.json"
 MIXED = "begun by revision {before} of the solver, gone on with by revision {now}: it counts as of the older one"
-EXIT_STATUS = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
+EXIT_STATUS = {SUCCEEDED: 0, "failed": 1, "refused": 2, "interrupted": 130}
 
 
 def main() -> int:
@@ -56,6 +57,8 @@ def main() -> int:
     profile = [entry[0] for entry in ranks.everyones(np.array([ranks.watch.read()], dtype=object))]
     if ranks.root:
         record_end(directory, state, message, profile=profile)
+        if state == SUCCEEDED:
+            clear(directory)
     return EXIT_STATUS[state]
 
 
@@ -120,7 +123,8 @@ def execute(
         recorder = Recorder(directory, setup, scheme, state, identity, wall_time, requests, arguments.progress)
         try:
             ending = run(scheme, state, integrator, recorder)
-            recorder.checkpoint(scheme, state, integrator)
+            if ending is not Ending.DONE or case.output.keep_checkpoint:
+                recorder.checkpoint(scheme, state, integrator)
         except (RunError, FloatingPointError) as error:
             recorder.keep(scheme, state)
             checkpoint_time = f"the last good checkpoint is at t = {recorder.checkpoint_time:.6g}"
@@ -128,7 +132,7 @@ def execute(
         finally:
             recorder.close()
         if ending is Ending.DONE:
-            return "done", None
+            return SUCCEEDED, None
         if ending is Ending.STOPPED:
             return "interrupted", f"checkpoint at t = {state.time:.6g}"
         del scheme, state, recorder  # the mesh is divided anew: the run goes on from the checkpoint
@@ -164,6 +168,8 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> tuple[Case
     if resumed and not (kept or path.exists()):
         raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from, and no {path.name} to begin with")
     output.remove_torn(directory)
+    if resumed and not kept and read_run(directory).get("state") == SUCCEEDED:
+        raise output.DirectoryError(f"{directory}: has come to its end already; there is nothing to go on with")
     if resumed:
         return load_case(path), not kept
     case = load_case(arguments.case)
@@ -196,6 +202,8 @@ class Recorder:
         self.snapshots = output.Snapshots(directory, case, setup.positions, self.collector, fresh)
         self.checkpoint_time, self.checkpoint_clock = state.time, -np.inf if fresh else time.monotonic()
         self.latest: dict[str, Any] = {}  # history row
+        ends = self.rows.vacancy_ratios() if self.rows is not None else None
+        self.ratios: tuple[float, float] | None = self.ranks.from_root(ends)  # vacancy: of the first and the last row
         self.noted = False  # that a particle is pressed against a wall
         self.shown, self.started = -np.inf, (time.monotonic(), state.time, state.evaluations)
 
@@ -207,6 +215,8 @@ class Recorder:
                 record_note(self.directory, note)
         row = self.observables.row(system, state, u, time_, self._wall_time())
         self.latest = row
+        ratio = row["vacancy_ratio"]
+        self.ratios = (ratio if self.ratios is None else self.ratios[0], ratio)
         if self.rows is not None:
             self.rows.append(row)
 
@@ -221,14 +231,26 @@ class Recorder:
         self.snapshot(self.snapshots.next(state.time), system, state, u, state.time)
 
     def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
-        """Checkpoint when it is time or somebody asks; True when somebody asks for the end."""
+        """A row where the vacancy ratio has moved; a checkpoint when it is time or somebody asks; True when somebody
+        asks for the end.
+        """
         due = time.monotonic() - self.checkpoint_clock >= system.case.output.checkpoint_every
-        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end]
-        due, asked, stop = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
+        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end, self._moved(system, state)]
+        due, asked, stop, moved = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
+        if moved:
+            self.history(system, state, system.at(state, integrator.y), state.time)
         self._show(system, state)
         if (due or asked) and not stop:
             self.checkpoint(system, state, integrator)
         return bool(stop)
+
+    def _moved(self, system: System, state: Progress) -> bool:
+        """Whether the vacancy ratio is `output.history_change` of its first value away from that of the last row."""
+        change = system.case.output.history_change
+        if not change or not state.step or self.ratios is None:
+            return False
+        first, last = self.ratios
+        return first > 0.0 and abs(self.observables.vacancy_ratio(state) - last) >= change * first
 
     def checkpoint(self, system: System, state: Progress, integrator: Integrator) -> None:
         """Make the state durable, and the rows before it."""
@@ -313,6 +335,13 @@ def record_end(
     add_to_log(directory, f"{state}{': ' + message if message else ''}")
     if message:
         print(f"{state}: {message}", file=sys.stderr, flush=True)
+
+
+def clear(directory: Path) -> None:
+    """After the end of the case: nothing goes on from the checkpoint, and nobody needs the lock."""
+    if not load_case(directory / "case.json").output.keep_checkpoint:
+        (directory / checkpoint.NAME).unlink(missing_ok=True)
+    (directory / output.LOCK).unlink(missing_ok=True)
 
 
 def record_note(directory: Path, note: str) -> None:

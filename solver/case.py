@@ -74,6 +74,13 @@ def _counted_on(x: float) -> float:
     return x + 0.0
 
 
+def _not_tiny(x: float) -> float:
+    """A part of something, of which there are not too many."""
+    if 0.0 < x < 1e-3:
+        raise PydanticCustomError("tiny", "must be 0 or between 0.001 and 1")
+    return x + 0.0
+
+
 def _in_parts(items: object, check: ValidatorFunctionWrapHandler) -> object:
     """A long list is checked part by part up to the first that has something wrong: errors are not without end."""
     if not isinstance(items, list | tuple) or len(items) <= TOGETHER:
@@ -512,9 +519,13 @@ class Output(Table):
 
     model_config = ConfigDict(json_schema_extra=lambda schema: schema.update(required=[]))
     alone: ClassVar = ("history_every", "snapshots", "vacancy_box", "checkpoint_every")
+    added: ClassVar = {"history_change": 0.02}
 
     history_every: Positive
     """model time between history rows [1] (default: time.end / 100)"""
+    history_change: Annotated[float, FINITE, Field(ge=0, le=1), AfterValidator(_not_tiny)] = 0.02
+    """also a row whenever the vacancy ratio has moved by this part of its first value [1], at least 0.001; 0: no such
+    rows"""
     snapshots: Snapshots
     """increasing times [1] up to time.end, or { every = ... } (default: [0, time.end])"""
     vacancy_box: Box
@@ -522,10 +533,12 @@ class Output(Table):
     particles, shrunk to 80 % about its centre)"""
     checkpoint_every: Positive = 60.0
     """wall-clock seconds between checkpoints"""
+    keep_checkpoint: Flag = False
+    """whether the last one stays when the run has come to its end"""
 
     def essence(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """How often a checkpoint is written changes nothing."""
-        return {key: value for key, value in super().essence(tree).items() if key != "checkpoint_every"}
+        """Checkpoints change nothing."""
+        return {key: value for key, value in super().essence(tree).items() if "checkpoint" not in key}
 
     def snapshot_count(self, end: float) -> float:
         """How many snapshots a run to `end` writes, reckoned without making them."""

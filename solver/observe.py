@@ -10,6 +10,7 @@ from .case import Box, Case
 from .discretisation import Discretisation
 from .geometry import Mesh
 from .neck import Neck
+from .pack_box import PackBox, overlap
 from .partition import Collector
 from .points import on_mesh
 from .scheme import Scheme
@@ -27,6 +28,7 @@ class Observables:
         low, high = (np.asarray(corner, dtype=float) for corner in box or case.output.vacancy_box)
         self.box_volume = float(np.prod(high - low))
         self.box_weights = box_weights(case, mesh, d, low, high)
+        self.pack, self.edge = PackBox(case), d.weights ** (1.0 / d.dim)
         self.pair = particles == 2
         self.collector = Collector(d.share, d.share.total) if self.pair else None
         self.neck = Neck(case, mesh) if self.pair and d.share.ranks.root else None
@@ -49,10 +51,25 @@ class Observables:
         fractions = sums[2] / sums[3], sums[2] / sums[3]
         vacancy_ratio = 1.0 - sums[4] / self.box_volume
         row = history_row(state, time, wall_time, moments, vacancy_ratio, sums[0], sums[1], fractions, extremes)
+        row["pack_porosity"] = self._porosity(vacancy_ratio, rho[:, 0], moments)
         if self.collector is not None:
             row["neck_length"] = self._neck(state, u)
             row["centre_distance"] = distance(moments)
         return row
+
+    def vacancy_ratio(self, state: State) -> float:
+        """Of the state's own fields. Collective."""
+        return float(1.0 - self.d.share.ranks.sum(np.array([self.box_weights @ state.u[:, 0]]))[0] / self.box_volume)
+
+    def _porosity(self, vacancy_ratio: float, rho: Floats, moments: Floats) -> float:
+        """1 - mean rho in the pack's own box: by how much means over the points differ there and in the fixed one.
+
+        rho (points,), moments as in `row`. Collective.
+        """
+        boxes, x = ((self.pack.low, self.pack.high), self.pack.now(moments)), self.d.x + 0.5 * self.pack.size
+        inside = [self.d.weights * overlap(x, self.edge[:, None], *box).prod(axis=1) for box in boxes]
+        solid, volume = self.d.share.ranks.sum(np.array([[w @ rho, w.sum()] for w in inside])).T
+        return float(vacancy_ratio + solid[0] / volume[0] - solid[1] / volume[1])
 
     def _neck(self, state: State, u: Floats) -> float | None:
         assert self.collector is not None  # narrows the type: only called for a pair

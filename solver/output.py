@@ -25,6 +25,7 @@ class DirectoryError(ValueError):
     """A run directory that cannot be used; the message says why."""
 
 
+LOCK = "lock"
 OWN = ("case.json", "checkpoint.h5", "history.jsonl", "particles.csv", "run.json")  # files that the solver replaces
 
 
@@ -52,12 +53,18 @@ def now() -> str:
 
 def lock(directory: Path) -> None:
     """Hold the run directory until this process ends; DirectoryError where another one holds it."""
-    handle = os.open(directory / "lock", os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    while True:
+        handle = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(handle), os.stat(directory / LOCK)):
+                return
+        except FileNotFoundError:
+            pass  # a run that came to its end has just removed it
+        except OSError as error:
+            os.close(handle)
+            raise DirectoryError(f"{directory}: another process is running here") from error
         os.close(handle)
-        raise DirectoryError(f"{directory}: another process is running here") from error
 
 
 class History:
@@ -77,6 +84,11 @@ class History:
         if not self.path.exists():
             return []
         return [line for line in self.path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+    def vacancy_ratios(self) -> tuple[float, float] | None:
+        """Of the first and the last row, where there is one."""
+        rows = [json.loads(line)["vacancy_ratio"] for line in self._lines()]
+        return (rows[0], rows[-1]) if rows else None
 
     def append(self, row: dict[str, Any]) -> None:
         """Add a row."""
@@ -176,26 +188,32 @@ def fields_of(values: Floats, owner: Numbers) -> Fields:
 
 
 def create_group(path: Path, case: Case, count: int, block: int) -> None:
-    """An empty group for so many nodes, without consolidated metadata."""
-    import zarr
+    """An empty group for so many nodes, without consolidated metadata.
 
+    Fields are kept in 32 bits: 1e-7 of their largest value.
+    """
+    import zarr
+    from zarr.codecs import BloscCodec, BloscShuffle
+
+    packed = BloscCodec(cname="zstd", clevel=5, shuffle=BloscShuffle.shuffle)
     group = zarr.open_group(path, mode="w", zarr_format=3, attributes=ATTRIBUTES | {"name": case.name})
     group.create_array(
         "nodes", shape=(count, case.dim), chunks=(block, case.dim), dtype="float64", dimension_names=("node", "axis"),
-        attributes={"units": "nm", "long_name": "position of the node"},
+        compressors=packed, attributes={"units": "nm", "long_name": "position of the node"},
     )  # fmt: skip
     group.create_array(
         "time", shape=(0,), chunks=(1,), dtype="float64", dimension_names=("time",),
         attributes={"units": "1", "long_name": "model time"}, fill_value=np.nan,
     )  # fmt: skip
     described = {
-        "rho": ("float64", np.nan, "concentration: 1 solid, 0 vacancy"),
-        "eta_squared": ("float64", np.nan, "sum of the squared order parameters"),
+        "rho": ("float32", np.nan, "concentration: 1 solid, 0 vacancy"),
+        "eta_squared": ("float32", np.nan, "sum of the squared order parameters"),
         "particle": ("int32", -1, "number of the particle that owns the node, -1: vacancy"),
     }
     for name, (kind, fill, words) in described.items():
         group.create_array(
             name, shape=(0, count), chunks=(1, block), dtype=kind, dimension_names=("time", "node"),
+            compressors=packed,
             attributes={"units": "1", "long_name": words}, fill_value=fill,
         )  # fmt: skip
 

@@ -28,6 +28,9 @@ class Rows(Protocol):
     def row(self, system: Any, state: Any, u: Floats, time: float, wall_time: float) -> dict[str, Any]:
         """One row; collective, and of use on rank 0 alone."""
 
+    def vacancy_ratio(self, state: Any) -> float:
+        """Of the state's own fields. Collective."""
+
 
 class Setup(Protocol):
     """All that depends on where the nodes are. Every method but `positions` and `order_parameter` is collective."""

@@ -1,5 +1,6 @@
 """Sweeps over cases, and their results."""
 
-from .analysis import Results, Run, open_results
+from .analysis import QueryError, Results, Run, open_results
+from .ranking import Ranking
 
-__all__ = ["Results", "Run", "open_results"]
+__all__ = ["QueryError", "Ranking", "Results", "Run", "open_results"]

@@ -12,7 +12,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 
 from frit.solver.case import CaseError, Place, Problem, case_schema, read_tree, refusal, showable, unknown_part
 
-FREE = ("name", "output.checkpoint_every")  # keys that change no result: axes along them would repeat one case
+# Keys that change no result: axes along them would repeat one case.
+FREE = ("name", "output.checkpoint_every", "output.keep_checkpoint")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Whole = Annotated[int, Field(strict=True)]

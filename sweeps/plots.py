@@ -1,4 +1,4 @@
-"""Pictures of one run directory: a snapshot as sections through the pack, the history as curves.
+"""One run directory: its history as curves, its snapshots as sections through the pack; `pictures` puts these together.
 
 matplotlib and zarr are imported where a figure is made, for read_history() must stay quick; pyplot is not, so
 that a notebook's or a server's own backend is left alone.
@@ -16,7 +16,6 @@ from frit.solver.arrays import Array, Floats, Integers
 
 if TYPE_CHECKING:
     import zarr
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from scipy.spatial import cKDTree
 
@@ -62,11 +61,11 @@ def plot_history(directory: Path, out: Path) -> None:
     history = read_history(directory)
     if not history:
         raise PlotError(f"{directory} has no history to draw")
-    case = _read_case(directory)
+    case = read_case(directory)
     flat = len(case["domain"]["size"]) == 2
     panels = [(key, plane if flat else solid) for key, plane, solid in PANELS if key in history]
     heights = [2.0 if key == "vacancy_ratio" else 1.0 for key, _ in panels]
-    figure = _figure(5.2, 1.15 * sum(heights) + 0.7)
+    figure = new_figure(5.2, 1.15 * sum(heights) + 0.7)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for ax, (key, label) in zip(axes, panels, strict=True):
         marker = "." if len(history[key]) < 2 else None
@@ -77,7 +76,7 @@ def plot_history(directory: Path, out: Path) -> None:
     axes[0].set_title(case["name"], parse_math=False)
     axes[-1].set_xlabel("time (model units)")
     figure.align_ylabels(list(axes))
-    _save(figure, out)
+    save(figure, out)
 
 
 # --- snapshots ------------------------------------------------------------------------------------------
@@ -97,8 +96,27 @@ class Snapshot:
 
 def nearest_time(directory: Path, time: float) -> float:
     """The time of the snapshot that is nearest to `time`."""
-    times = np.asarray(_array(_open(directory), "time")[:], float)
-    return float(times[_nearest(times, time, directory)])
+    times = snapshot_times(directory)
+    return times[_nearest(times, time, directory)]
+
+
+def snapshot_times(directory: Path) -> list[float]:
+    """The times of all snapshots. Raises `PlotError` where there are none."""
+    times = np.asarray(_array(_open(directory), "time")[:], float).tolist()
+    if not times:
+        raise PlotError(f"{directory} has no snapshots to draw")
+    return list(times)
+
+
+def far_away(directory: Path, time: float) -> str | None:
+    """What to say where no snapshot is near a time: nearer than half the way to its next one."""
+    times = snapshot_times(directory)
+    nearest = min(times, key=lambda t: abs(t - time))
+    others = [abs(t - nearest) for t in times if t != nearest]
+    if abs(nearest - time) <= 0.5 * min(others, default=0.0) + 1e-9 * max(times):
+        return None
+    said = ", ".join(f"{t:g}" for t in times[:12]) + (", ..." if len(times) > 12 else "")
+    return f"there is no snapshot near t = {time:g}: the nearest is at t = {nearest:g}; there are {said}"
 
 
 def read_snapshot(directory: Path, time: float) -> Snapshot:
@@ -114,29 +132,6 @@ def read_snapshot(directory: Path, time: float) -> Snapshot:
         owner=np.asarray(_array(group, "particle")[row], int),
         first_owner=np.asarray(_array(group, "particle")[0], int),
     )
-
-
-def plot_snapshot(directory: Path, time: float, out: Path) -> float:
-    """Draw the snapshot nearest to `time`, in 3-D its three mid-planes; returns its time."""
-    case, snapshot = _read_case(directory), read_snapshot(directory, time)
-    size = np.asarray(case["domain"]["size"], float)
-    colours = particle_colours(snapshot.nodes, snapshot.first_owner, int(snapshot.owner.max(initial=0)))
-    planes = [(0, 1)] if len(size) == 2 else [(0, 1), (0, 2), (1, 2)]
-    width, height = sum(size[i] for i, _ in planes), max(size[j] for _, j in planes)
-    inches = 6.0 if len(size) == 2 else 9.0
-    figure = _figure(inches, (inches - 0.7 * len(planes)) * height / width + 0.8)
-    axes = figure.subplots(1, len(planes), squeeze=False, width_ratios=[size[i] for i, _ in planes])[0]
-    for ax, plane in zip(axes, planes, strict=True):
-        _draw_section(ax, snapshot, colours, size, plane)
-        if box := (case.get("output") or {}).get("vacancy_box"):
-            _draw_box(ax, np.asarray(box, float), plane)
-    title = f"{case['name']}, t = {snapshot.time:g}"
-    if len(planes) == 1:
-        axes[0].set_title(title, parse_math=False)
-    else:
-        figure.suptitle(title, fontsize=9.5, parse_math=False)
-    _save(figure, out)
-    return snapshot.time
 
 
 def particle_colours(nodes: Floats, owner: Integers, last: int = 0) -> Floats:
@@ -187,27 +182,31 @@ def thinned(nodes: Floats) -> Array:
     return kept
 
 
-def section(
-    snapshot: Snapshot, colours: Floats, size: Floats, plane: tuple[int, int]
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """x, y, rho (ny, nx) and picture (ny, nx, 3) of a plane, in 3-D of one through the middle."""
-    from scipy.spatial import cKDTree
+class Section:
+    """A plane through the domain, in 3-D through its middle: its pixels, and which nodes they are interpolated from."""
 
-    pitch = size.max() / PIXELS[len(size)]
-    x, y = (np.linspace(0, size[k], round(size[k] / pitch)) for k in plane)
-    at = np.tile(size / 2, (len(x) * len(y), 1))
-    at[:, plane] = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    close = thinned(snapshot.nodes)
-    for k in set(range(len(size))) - set(plane):
-        spacing = (np.prod(size) / len(close)) ** (1 / len(size))
-        close &= abs(snapshot.nodes[:, k] - size[k] / 2) < 4 * spacing
-    tree = cKDTree(snapshot.nodes[close])
-    density, order, owner = snapshot.rho[close], snapshot.eta_squared[close], snapshot.owner[close]
-    rho, picture = np.empty(len(at)), np.empty((len(at), 3))
-    for part in np.array_split(np.arange(len(at)), len(at) // 20_000 + 1):
-        near, weight = interpolation(tree, at[part])
-        rho[part], picture[part] = _shade(weight, density[near], order[near], owner[near], colours)
-    return x, y, rho.reshape(len(y), len(x)), picture.reshape(len(y), len(x), 3)
+    def __init__(self, nodes: Floats, size: Floats, plane: tuple[int, int], fineness: float = 1.0) -> None:
+        """fineness: times the pixels of a picture that stands alone."""
+        from scipy.spatial import cKDTree
+
+        pitch = size.max() / (fineness * PIXELS[len(size)])
+        self.x, self.y = (np.linspace(0, size[k], round(size[k] / pitch)) for k in plane)
+        at = np.tile(size / 2, (len(self.x) * len(self.y), 1))
+        at[:, plane] = np.stack(np.meshgrid(self.x, self.y), axis=-1).reshape(-1, 2)
+        close = thinned(nodes)
+        for k in set(range(len(size))) - set(plane):
+            spacing = (np.prod(size) / len(close)) ** (1 / len(size))
+            close &= abs(nodes[:, k] - size[k] / 2) < 4 * spacing
+        self.close, tree = np.flatnonzero(close), cKDTree(nodes[close])
+        self.parts = [interpolation(tree, part) for part in np.array_split(at, len(at) // 20_000 + 1)]
+
+    def shown(self, snapshot: Snapshot, colours: Floats) -> tuple[Floats, Floats]:
+        """rho (ny, nx) and picture (ny, nx, 3)."""
+        density, order, owner = snapshot.rho[self.close], snapshot.eta_squared[self.close], snapshot.owner[self.close]
+        found = [_shade(weight, density[near], order[near], owner[near], colours) for near, weight in self.parts]
+        rho, picture = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        shape = len(self.y), len(self.x)
+        return rho.reshape(shape), picture.reshape(*shape, 3)
 
 
 def _shade(
@@ -232,33 +231,14 @@ def _shade(
     return here, 1 + solid[:, None] * (colour + dark[:, None] * (BOUNDARY - colour) - 1)
 
 
-def _draw_section(
-    ax: "Axes", snapshot: Snapshot, colours: Floats, size: Floats, plane: tuple[int, int]
-) -> None:
-    x, y, rho, picture = section(snapshot, colours, size, plane)
-    (i, j), names = plane, "xyz"
-    ax.imshow(picture, origin="lower", extent=(0, size[i], 0, size[j]), interpolation="bilinear")
-    if rho.min() < 0.5 < rho.max():
-        ax.contour(x, y, rho, [0.5], colors="black", linewidths=0.6)
-    ax.set(xlabel=f"{names[i]} (nm)", ylabel=f"{names[j]} (nm)", aspect="equal", anchor="S")
-    for k in set(range(len(size))) - {i, j}:
-        ax.set_title(f"{names[k]} = {size[k] / 2:g} nm")
-
-
-def _draw_box(ax: "Axes", box: Floats, plane: tuple[int, int]) -> None:
-    from matplotlib.patches import Rectangle
-
-    (x, y), (width, height) = box[0, list(plane)], (box[1] - box[0])[list(plane)]
-    ax.add_patch(Rectangle((x, y), width, height, fill=False, ec="#444444", lw=0.8, ls=(0, (4, 3))))
-
-
-def _figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> "Figure":
+    """Inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=200, layout="constrained")
 
 
-def _save(figure: "Figure", out: Path) -> None:
+def save(figure: "Figure", out: Path) -> None:
     """In the sizes of a printed column; set here, for matplotlib's global settings are not ours."""
     for ax in figure.axes:
         ax.tick_params(labelsize=8, width=0.6)
@@ -274,7 +254,8 @@ def _save(figure: "Figure", out: Path) -> None:
 # --- files ----------------------------------------------------------------------------------------------
 
 
-def _read_case(directory: Path) -> dict[str, Any]:
+def read_case(directory: Path) -> dict[str, Any]:
+    """case.json of a run directory."""
     case: dict[str, Any] = json.loads((directory / "case.json").read_text())
     return case
 

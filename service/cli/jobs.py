@@ -31,6 +31,7 @@ def submit(
     tag: Annotated[list[str] | None, typer.Option(help="May be given several times.")] = None,
     time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Wall-clock time of an attempt.")] = None,
     recompute: Recompute = False,
+    again: Annotated[bool, typer.Option("--again", help="Compute a case that there is already once more.")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Stay to the end; exit status 1 unless all succeed.")] = False,
     url: Url = HERE,
     token: Secret = None,
@@ -42,7 +43,7 @@ def submit(
     options = {"ranks": ranks, "name": name, "priority": priority, "tags": tag or None, "time_limit": time_limit}
     with speaking(url, token, str(file)) as client:
         given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
-        submitted = client.submit(file, recompute=recompute, **given)
+        submitted = client.submit(file, recompute=recompute, reuse=not again, **given)
         if wait:
             submitted.wait()
         found = [submitted] if isinstance(submitted, RemoteJob) else list(submitted.jobs())
@@ -50,6 +51,8 @@ def submit(
             typer.echo(json.dumps(submitted.data, indent=2))
         else:
             typer.echo(submitted.id)
+            if isinstance(submitted, RemoteJob) and not wait and submitted.state != "queued":
+                typer.echo(f"this case is there already: {submitted.state}; --again computes it once more", err=True)
             if wait:
                 show_table([row(job) for job in found])
         if wait and any(job.state != "succeeded" for job in found):

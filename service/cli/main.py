@@ -20,11 +20,13 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from ..jobs.launch import Launch, LaunchError, Outcome, read_record
-from . import compare, index, jobs, serve, service, sweep, token
+from frit.solver.ended import SUCCEEDED, read_run
+
+from ..jobs.launch import Launch, LaunchError, Outcome
+from . import compare, index, jobs, pictures, serve, service, sweep, token
 from .terminal import AsJson, cell, in_words, refuse
 
-EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
+EXIT = {SUCCEEDED: 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
 
 app = typer.Typer(
@@ -88,7 +90,7 @@ def run(
     """Run one case here; Ctrl-C writes a checkpoint and ends."""
     check_case(case)
     directory = out or Path("runs") / case.stem
-    state = read_record(directory).get("state")
+    state = read_run(directory).get("state")
     if (directory / "run.json").exists() and state != "refused":
         resumable = any((directory / name).exists() for name in ("checkpoint.h5", "case.json"))
         way = f"`frit resume {directory}` goes on with it" if resumable else "it has no checkpoint: remove it"
@@ -105,10 +107,10 @@ def resume(
     as_json: AsJson = False,
 ) -> None:
     """Go on from the last checkpoint; anew where there was none yet."""
-    record = read_record(directory)
-    if record.get("state") == "done":
+    record = read_run(directory)
+    if record.get("state") == SUCCEEDED:
         typer.echo(f"{directory} is done already", err=True)
-        report(directory, Outcome("done", record.get("message"), 0, ""), {}, None, as_json)
+        report(directory, Outcome(SUCCEEDED, record.get("message"), 0, ""), {}, None, as_json)
         return
     if not (directory / "checkpoint.h5").exists():
         if not (directory / "case.json").exists():
@@ -118,34 +120,8 @@ def resume(
     follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
 
 
-@app.command()
-def plot(
-    directory: RunDirectory,
-    time: Annotated[
-        float | None, typer.Option(metavar="T", help="Model time; the nearest snapshot is shown.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", dir_okay=False, help="Default: in DIR; .pdf, .svg too.")
-    ] = None,
-) -> None:
-    """Picture of the snapshot nearest to --time; of the history without it."""
-    from frit.sweeps import plots
-
-    try:
-        if time is None:
-            out = out or directory / "history.png"
-            plots.plot_history(directory, out)
-            typer.echo(f"{out}: history")
-        else:
-            time = plots.nearest_time(directory, time)
-            out = out or directory / f"snapshot-{time:g}.png"
-            plots.plot_snapshot(directory, time, out)
-            typer.echo(f"{out}: snapshot at t = {time:g}")
-    except (ValueError, OSError) as error:
-        refuse(str(error))
-
-
-for command in (serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
+for command in (pictures.plot, pictures.movie,
+                serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
                 jobs.change, jobs.gc, compare.compare, service.plan, service.limits, service.events):  # fmt: skip
     app.command()(command)
 app.command("rm")(jobs.remove)
@@ -214,7 +190,7 @@ def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, pro
                 bar.update(task, description=in_words(progress))
         outcome = launch.wait()
     report(directory, outcome, progress, monotonic() - start, as_json)
-    if profile and (seconds := read_record(directory).get("profile")):
+    if profile and (seconds := read_run(directory).get("profile")):
         from frit.solver.profile import table
 
         typer.echo("\n" + table(seconds), err=as_json)
@@ -262,7 +238,7 @@ def report(
         for key, value in summary.items():
             values = value if isinstance(value, list) else [value]
             typer.echo(f"{key.replace('_', ' '):15}{' -> '.join(map(cell, values))}")
-    for note in read_record(directory).get("notes", []):
+    for note in read_run(directory).get("notes", []):
         typer.echo(f"note: {note}", err=True)
     if outcome.state in ("failed", "refused"):
         log = directory / "log.txt"

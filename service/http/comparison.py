@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from ..index.records import SweepRecord
 from ..index.store import Store
-from . import filters, views
+from . import filters, shown, views
 
 CURVES = 1000  # on a page, at most
 ROWS = 10_000  # points of a curve, at most
@@ -32,14 +32,15 @@ def compare(store: Store, sweep: SweepRecord, observable: str, page: Page | None
     found = store.compared(sweep.seq, page.after, page.limit + 1)
     jobs = found[: page.limit]
     curves = store.curves([job.seq for job in jobs], observable, page.rows)
-    shown = []
+    curves_shown = []
     for job in jobs:
         times, values = curves.get(job.seq, ([], []))
-        shown.append(
+        curves_shown.append(
             views.Curve(
                 job=job.id, name=job.name, state=job.state,
                 parameters={name: job.parameters.get(name) for name in differing},
                 time=times, values=values, final=values[-1] if values else None, older=job.older,
+                message=shown.without_path(job.message, str(store.path.parent)), pack_porosity=job.porosity,
             )
         )  # fmt: skip
     following = None
@@ -47,5 +48,5 @@ def compare(store: Store, sweep: SweepRecord, observable: str, page: Page | None
         place = f"observable={observable}&limit={page.limit}&after={page.after + page.limit}&rows={page.rows}"
         following = f"/v1/sweeps/{sweep.id}/compare?{place}"
     return views.Comparison(
-        sweep=sweep.id, observable=observable, differing=differing, curves=shown, next=following
+        sweep=sweep.id, observable=observable, differing=differing, curves=curves_shown, next=following
     )  # fmt: skip

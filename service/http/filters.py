@@ -40,7 +40,7 @@ COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
 }  # fmt: skip
 INDEXED = ("particles.mean_radius", "particles.std_radius", "particles.packing_density", "result.vacancy_ratio")
 RESULTS = ("time", "step", "vacancy_ratio", "solid_mass", "free_energy", "live_fraction", "particles", "evaluations",
-           "wall_time", "neck_length", "centre_distance")  # fmt: skip
+           "wall_time", "pack_porosity", "neck_length", "centre_distance")  # fmt: skip
 NATIVE = (*INDEXED, "id", "identity", "name", "state", "owner")  # what the schema has an index of
 PACKING = re.compile(r"result\.packing(\.[A-Za-z_][A-Za-z0-9_]*){1,3}")
 

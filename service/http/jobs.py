@@ -2,12 +2,15 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from concurrent.futures import Future
+from typing import Annotated
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.responses import StreamingResponse
 
 from ..index.records import NotFoundError
+from ..jobs.states import Job, NewJob
 from . import admission, delivery, filters, openapi, shown, stream, views
 from .asking import (
     GivenKey,
@@ -25,9 +28,12 @@ from .asking import (
     running,
 )
 from .bodies import SMALL, LimitedRoute, declared
+from .comparison import ROWS
+from .problems import WrongField, refused
 from .security import Reader, Submitter, still_admitted
 
 PROBLEMS = openapi.problems
+TOGETHER, ALL_ROWS = 100, 100_000  # jobs, and rows of all, in one answer with histories
 
 api = APIRouter(prefix="/v1", route_class=LimitedRoute)
 
@@ -39,7 +45,15 @@ api = APIRouter(prefix="/v1", route_class=LimitedRoute)
 async def submit_job(
     submission: views.JobSubmission, request: Request, who: Submitter, given: GivenKey = None
 ) -> Response:
-    """Queue a case. Every request makes a job, also of a case that was run before; see Idempotency-Key."""
+    """Queue a case. Every request makes a job, also of a case that was run before, unless `reuse` is true: then the job
+    that there is of the case is the answer, tried again where it was cancelled or lost. See Idempotency-Key.
+    """
+
+    def queued(new: NewJob) -> "Future[Job]":
+        if not submission.reuse:
+            return engine.store.submit(new, key)
+        return engine.store.reuse(new, key, not engine.settings.private, submission.recompute)
+
     engine, rooms = running(request), rooms_of(request)
     key = await key_of_body(given, who, "POST /v1/jobs", submission)
     if key is not None and (before := engine.store.known(key)) is not None:
@@ -48,12 +62,12 @@ async def submit_job(
         if declared(request) < SMALL and not admission.needs_files(submission.case, submission.files):
             new = admission.job_of(submission, engine.settings, owner=who.label)
             rooms.quotas.admit(who, 1, new.ranks)
-            job = await asyncio.wrap_future(engine.store.submit(new, key))
+            job = await asyncio.wrap_future(queued(new))
         else:
             async with admission.taken(submission.case, submission.files, "/case", rooms, who) as uploads:
                 new = await asyncio.to_thread(admission.job_of, submission, engine.settings, uploads, who.label)
                 rooms.quotas.admit(who, 1, new.ranks)
-                job = await asyncio.wrap_future(engine.store.submit(new, key))
+                job = await asyncio.wrap_future(queued(new))
     return made(job_view(engine, job), f"/v1/jobs/{job.id}")
 
 
@@ -87,6 +101,30 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
     if following is not None:
         response.headers["Link"] = f'<{following}>; rel="next"'
     return answer
+
+
+@api.get("/histories", tags=["jobs"], responses=PROBLEMS(401, 403, 404, 422, 503), response_model=views.Histories)
+async def show_histories(
+    engine: TheEngine, who: Reader,
+    id: Annotated[str, Query(max_length=5000, pattern=r"^[0-9a-zA-Z-]+(,[0-9a-zA-Z-]+)*$", description="Of jobs.")],
+    rows: Annotated[int, Query(ge=2, le=ROWS, description="Rows of a history, at most: spread over all.")] = 1000,
+) -> Response:  # fmt: skip
+    """The histories of up to 100 jobs, in at most 100 000 rows together, in the order in which they are named."""
+    named = id.split(",")
+    if len(named) > TOGETHER or len(named) * rows > ALL_ROWS:
+        said = f"must be at most {TOGETHER} jobs, and at most {ALL_ROWS} rows together: {len(named)} times {rows}"
+        raise refused("refused-query", "The query is refused", [WrongField(parameter="id", value=id[:80], detail=said)])
+
+    def found() -> str:
+        jobs = [engine.store.job(name) for name in named]
+        for name, job in zip(named, jobs, strict=True):
+            if not who.sees(job.owner):
+                raise NotFoundError(f"job {name!r}: there is none, or several begin so")
+        lines = engine.store.histories([job.seq for job in jobs], rows)
+        parts = [f'{{"job":"{job.id}","rows":[{",".join(lines.get(job.seq, ()))}]}}' for job in jobs]
+        return f'{{"histories":[{",".join(parts)}]}}'
+
+    return Response(await asyncio.to_thread(found), media_type="application/json")
 
 
 @api.get("/jobs/{id}", tags=["jobs"], response_model=views.JobView, responses=openapi.cached())

@@ -65,7 +65,8 @@ def need(case: Tree, ranks: int) -> Need:
     dim, end, output = len(case["domain"]["size"]), case["time"]["end"], case["output"]
     nodes, points = mesh_of(case)
     particles = particles_of(case["particles"])
-    rows = amounts.times(end, output["history_every"])
+    change = output.get("history_change", 0.0)  # which cases of old have not
+    rows = amounts.times(end, output["history_every"]) + (1.0 / change if change else 0.0)
     snapshots = snapshots_of(output["snapshots"], end)
     shared = case["activation"]["few_order_parameters"]
     slots = min(particles, MANY_SLOTS[dim]) if shared else particles

@@ -70,6 +70,8 @@ class JobSubmission(Body):
     tags: Tags = []
     time_limit: Limit | None = None
     files: Files = {}
+    reuse: Annotated[bool, Field(strict=True, description="Take the job that there is of this case, if any.")] = False
+    recompute: Annotated[bool, Field(strict=True, description="With reuse: not what an older solver computed.")] = False
 
 
 class SweepSubmission(Body):
@@ -208,6 +210,19 @@ class JobPage(BaseModel):
     next: str | None
 
 
+class History(BaseModel):
+    """Rows of a job's history, as the solver wrote them."""
+
+    job: str
+    rows: list[dict[str, Any]]
+
+
+class Histories(BaseModel):
+    """Histories of several jobs."""
+
+    histories: list[History]
+
+
 class SnapshotView(BaseModel):
     """A complete snapshot: its place along the arrays' first axis, and its model time."""
 
@@ -253,7 +268,8 @@ class SweepPage(BaseModel):
 class Curve(BaseModel):
     """An observable of one job over model time. `parameters`: those that differ within the sweep.
 
-    `older`: the revision of the solver that computed it, where it is not the present one's.
+    `older`: the revision of the solver that computed it, where it is not the present one's; `pack_porosity`: of the
+    pack's own box, at the end.
     """
 
     job: str
@@ -264,6 +280,8 @@ class Curve(BaseModel):
     values: list[float | None]
     final: float | None
     older: int | None
+    message: str | None
+    pack_porosity: float | None
 
 
 class Comparison(BaseModel):

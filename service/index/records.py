@@ -98,6 +98,8 @@ class Compared(NamedTuple):
     state: State
     parameters: dict[str, Any]
     older: int | None  # see `states.Job.older`
+    message: str | None
+    porosity: float | None  # of the pack's own box, in the last history row
 
 
 class Usage(NamedTuple):
@@ -144,6 +146,7 @@ COLUMNS = ", ".join(f'"{name}"' for name in NAMES)
 LISTS = ("$.particles.centres", "$.particles.radii", "$.particles.sizes")  # most of a large case
 WITHOUT = sa.func.json_remove(jobs.c.case, *LISTS).label("case")
 MADE_BY = sa.func.json_extract(jobs.c.result, "$.revision").label("revision")
+POROSITY = sa.func.json_extract(jobs.c.result, "$.pack_porosity").label("porosity")
 OLD_CASE = sa.case((MADE_BY != REVISION, WITHOUT)).label("case")  # where the revision does not tell all
 BRIEF = [WITHOUT if column.name == "case" else column for column in jobs.c]
 

@@ -20,6 +20,7 @@ from .records import (
     KeyReusedError,
     NewPoint,
     SweepRecord,
+    by_seq,
     compact,
     find_job,
     find_sweep,
@@ -43,6 +44,24 @@ class Submissions(Writer):
     def submit(self, job: NewJob, key: Key | None = None) -> "Future[Job]":
         """Queue a job. With a key that came before, the job it made then. Raises `KeyReusedError`."""
         return self.put(Share(_submit, _Submission(job, key), Future()))
+
+    def reuse(
+        self, job: NewJob, key: Key | None = None, shared: bool = True, recompute: bool = False
+    ) -> "Future[Job]":
+        """The job that there is of this case, or a new one; `shared`, `recompute` and what is tried again as in
+        `submit_sweep`.
+        """
+
+        def effect(t: Transaction) -> Job:
+            if (before := known(t, key)) is not None:
+                return find_job(t.connection, before)
+            mine = () if shared else (jobs.c.owner.is_not_distinct_from(job.owner),)
+            seq = _jobs_of_points(t, [NewPoint(job, {})], recompute, mine)[job.identity]
+            found = by_seq(t.connection, seq)
+            remember(t, key, found.id)
+            return found
+
+        return self.write(effect)
 
     def rerun(self, identifier: str, owner: str | None, key: Key | None = None) -> "Future[Job]":
         """Queue the case of a job once more, from its start, as a job of its own."""

@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import sqlalchemy as sa
 
 from ..jobs.states import older_revision
 from .reading import Reading
-from .records import MADE_BY, OLD_CASE, Compared, SweepPoint, SweepRecord, find_sweep, record
+from .records import MADE_BY, OLD_CASE, POROSITY, Compared, SweepPoint, SweepRecord, find_sweep, record
 from .schema import history, jobs, sweep_jobs, sweeps
 
 
@@ -64,15 +65,15 @@ class SweepQueries(Reading):
         """The jobs of a sweep (by seq), in its own order, from that point on."""
         query = (
             sa.select(jobs.c.seq, jobs.c.id, sweep_jobs.c.name, jobs.c.state, sweep_jobs.c.parameters)
-            .add_columns(MADE_BY, OLD_CASE)
+            .add_columns(MADE_BY, OLD_CASE, jobs.c.message, POROSITY)
             .join_from(sweep_jobs, jobs).where(sweep_jobs.c.sweep == sweep).order_by(sweep_jobs.c.position)
             .offset(after).limit(limit)
         )  # fmt: skip
         with self.reading() as connection:
             rows = connection.execute(query).all()
         return [
-            Compared(seq, identifier, name, state, parameters, older_revision(revision, case))
-            for seq, identifier, name, state, parameters, revision, case in rows
+            Compared(seq, identifier, name, state, parameters, older_revision(revision, case), message, porosity)
+            for seq, identifier, name, state, parameters, revision, case, message, porosity in rows
         ]
 
     def differing(self, sweep: int) -> list[str]:
@@ -83,6 +84,13 @@ class SweepQueries(Reading):
         )
         return [key for (key,) in self._ask(query, (sweep,))]
 
+    def histories(self, which: Sequence[int], most: int) -> dict[int, list[str]]:
+        """History rows (JSON) of jobs (by seq): `most` of them, spread over the rows, as `curves` takes them."""
+        found: dict[int, list[str]] = {}
+        for job, _, line in self._spread(which, "data", None, most):
+            found.setdefault(job, []).append(line)
+        return found
+
     def curves(
         self, which: Sequence[int], observable: str, most: int
     ) -> dict[int, tuple[list[float], list[float | None]]]:
@@ -90,8 +98,16 @@ class SweepQueries(Reading):
 
         The last row is among them, and every row where there are not more.
         """
-        own = observable in history.c
-        value = f'"{observable}"' if own else "json_extract(data, ?1)"
+        value = f'"{observable}"' if observable in history.c else "json_extract(data, ?1)"
+        found: dict[int, tuple[list[float], list[float | None]]] = {}
+        for job, at, number in self._spread(which, value, f"$.{observable}", most):
+            times, values = found.setdefault(job, ([], []))
+            times.append(at)
+            values.append(number)
+        return found
+
+    def _spread(self, which: Sequence[int], value: str, path: str | None, most: int) -> list[tuple[int, float, Any]]:
+        """(job, time, value) of rows of jobs; value: SQL of a row, where ?1 is the path."""
         query = (
             "WITH RECURSIVE each AS MATERIALIZED ("
             "SELECT value AS job, (SELECT max(row) FROM history WHERE job = value) AS last FROM json_each(?3)), "
@@ -100,9 +116,4 @@ class SweepQueries(Reading):
             "ON history.job = each.job AND row = min(n * (last / ?2 + 1), last) "
             "WHERE n = 0 OR (n - 1) * (last / ?2 + 1) < last"
         )  # row by row of one job after the other: nothing is sorted, and no row between is read
-        found: dict[int, tuple[list[float], list[float | None]]] = {}
-        for job, at, number in self._ask(query, (f"$.{observable}", most - 1, json.dumps([*which]))):
-            times, values = found.setdefault(job, ([], []))
-            times.append(at)
-            values.append(number)
-        return found
+        return self._ask(query, (path, most - 1, json.dumps([*which])))

@@ -16,11 +16,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from frit.solver.durable import read_json, stamp
+from frit.solver.durable import stamp
+from frit.solver.ended import ENDS, read_run
 
 from .child import Child
 
-ENDS = ("done", "failed", "interrupted", "refused")
 # An outer MPI or Slurm step, which the ranks would join (PMI covers PMIX), and what makes Python write
 # a printed line in two parts, between which another rank's may get. No rank needs a token.
 SCRUBBED = ("PMI", "OMPI_COMM", "SLURM_STEP", "HYDI_", "MPI_LOCAL", "PYTHONUNBUFFERED", "FRIT_TOKEN")
@@ -87,11 +87,6 @@ def clean_environment(environ: Mapping[str, str]) -> dict[str, str]:
     """Without what is SCRUBBED; one thread a rank unless set."""
     kept = {key: value for key, value in environ.items() if not key.startswith(SCRUBBED)}
     return dict.fromkeys(THREADS, "1") | kept
-
-
-def read_record(directory: Path) -> dict[str, Any]:
-    """run.json; empty when it is not there or torn."""
-    return read_json(directory / "run.json")
 
 
 class Launch:
@@ -178,7 +173,7 @@ class Launch:
         """What run.json says, if it was written since the start, once the whole tree is gone."""
         for _ in self:
             pass
-        record, code, spoken = read_record(self.directory), self._process.wait(), "\n".join(self._spoken)
+        record, code, spoken = read_run(self.directory), self._process.wait(), "\n".join(self._spoken)
         fresh = stamp(self.directory / "run.json") != self._record_before
         if fresh and record.get("state") in ENDS:
             return Outcome(record["state"], record.get("message"), code, spoken, record.get("retry", False))

@@ -31,8 +31,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from frit.solver.durable import read_json, stamp, write_json
+from frit.solver.ended import SUCCEEDED, read_run
 
-from .launch import Launch, LaunchError, Outcome, find_mpirun, is_open_mpi, kill_marked, read_record
+from .launch import Launch, LaunchError, Outcome, find_mpirun, is_open_mpi, kill_marked
 from .memory import memory_below
 from .processes import boot, is_at, remove_torn, start_of, try_lock
 from .states import Exit, Move, one_sentence
@@ -97,6 +98,9 @@ def born(order: Order, lock: int) -> NoReturn:
         os.close(log)
         os.set_inheritable(lock, False)
         Runner(order, lock, adopts).run()
+        with suppress(OSError):
+            if not (said := Path(order.directory) / "runner.log").stat().st_size:
+                said.unlink()
         status = 0
     except BaseException:
         traceback.print_exc()
@@ -147,7 +151,7 @@ class Runner:
             self.stop(None)
         if self.reason is not None:
             return STOPS[self.reason], "stopped before mpirun was started"
-        if read_record(self.directory).get("state") == "done":  # only the word of the runner before was lost
+        if read_run(self.directory).get("state") == SUCCEEDED:  # only the word of the runner before was lost
             return Move.SUCCEED, None
         os.sched_setaffinity(0, self.order.cores)
         try:
@@ -168,7 +172,7 @@ class Runner:
             outcome = launch.wait()
         if outcome.retry and outcome.errors:
             log(outcome.errors)  # which may name paths
-        if self.greedy is not None and outcome.state != "done":
+        if self.greedy is not None and outcome.state != SUCCEEDED:
             return Move.FAIL, self.greedy
         return judge(outcome, self.reason)
 
@@ -277,7 +281,7 @@ class Runner:
 
 def judge(outcome: Outcome, reason: str | None) -> tuple[Move, str | None]:
     """What an outcome means for the job, stopped for this reason (None: nobody asked)."""
-    if outcome.state == "done":
+    if outcome.state == SUCCEEDED:
         return Move.SUCCEED, None
     if reason is not None and (outcome.state == "interrupted" or outcome.retry):
         return STOPS[reason], outcome.message

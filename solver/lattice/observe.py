@@ -9,6 +9,7 @@ from ..case import Box
 from ..neck import section
 from ..observe import distance, history_row
 from ..output import Fields
+from ..pack_box import PackBox, overlap
 from . import loops
 from .axis import Axis
 from .scheme import LatticeScheme, LatticeState
@@ -32,7 +33,8 @@ class LatticeObservables:
         g = scheme.lattice
         low, high = (np.asarray(corner, dtype=float) for corner in box or scheme.case.output.vacancy_box)
         self.box_volume = float(np.prod(high - low))
-        corners = (low[::-1], high[::-1]) if g.dim == 3 else (np.insert(low[::-1], 1, 0), np.insert(high[::-1], 1, 0))
+        corners = [along(corner) for corner in (low, high)]
+        self.pack, self.scheme = PackBox(scheme.case), scheme
         self.box = [
             np.ones(1) if axis is None else integrals(axis, corners[0][k], corners[1][k])
             for k, axis in enumerate(g.axes)
@@ -44,16 +46,16 @@ class LatticeObservables:
         """One history row, named as in the run directory's history.jsonl."""
         g, m, switch, count = scheme.lattice, scheme.lattice.coefficients, scheme.case.activation, scheme.particles
         held = slice(g.owned.start - g.planes.start, g.owned.stop - g.planes.start)
-        rho, slow = g.values(y)[held], self.box[0][g.owned.start : g.owned.stop]
+        rho = g.values(y)[held]
         m_slow, m_middle, m_fast = (sums[0] for sums in g.moments)  # m_a is the sum over p of their products
-        along = rho @ np.stack([*m_fast, self.box[2]], axis=1)  # the sums of rows, then those of planes
-        mass, box = sum(m_slow[p, g.owned] @ along[:, :, p] @ m_middle[p] for p in range(2)), slow @ along[:, :, 2]
+        rows = rho @ m_fast.T  # the sums of rows, then those of planes
+        mass = sum(m_slow[p, g.owned] @ rows[:, :, p] @ m_middle[p] for p in range(2))
         F, live, least, largest = loops.energy(
             y.reshape(1, -1), scheme.layout, g.tables, scheme.room, m, switch.eps_rho, switch.eps_eta,
             g.layers.start, g.layers.start, g.layers.stop,
         )  # fmt: skip
         moments = scheme.moments(y)
-        sums = np.concatenate([[mass, F, live, box @ self.box[1]], moments.ravel()])
+        sums = np.concatenate([[mass, F, live, self._in_box(rho)], moments.ravel()])
         if count == 2:
             sums = np.append(sums, neck(scheme, y))
         g.ranks.sum(sums)
@@ -63,10 +65,44 @@ class LatticeObservables:
         vacancy_ratio = 1.0 - sums[3] / self.box_volume
         fractions = sums[2] / points, 1.0
         row = history_row(state, time, wall_time, moments, vacancy_ratio, sums[0], sums[1], fractions, bounds)
+        row["pack_porosity"] = self._porosity(vacancy_ratio, rho, moments)
         if count == 2:
             row["neck_length"] = float(sums[-1])
             row["centre_distance"] = distance(moments)
         return row
+
+    def vacancy_ratio(self, state: LatticeState) -> float:
+        """Of the state's own fields. Collective."""
+        g = self.scheme.lattice
+        held = slice(g.owned.start - g.planes.start, g.owned.stop - g.planes.start)
+        return float(1.0 - g.ranks.sum(np.array([self._in_box(g.values(state.y)[held])]))[0] / self.box_volume)
+
+    def _in_box(self, rho: Floats) -> float:
+        """This rank's part of the field's integral over the vacancy box; rho: coefficients of the nodes it owns."""
+        slow = self.box[0][self.scheme.lattice.owned]
+        return float(slow @ (rho @ self.box[2]) @ self.box[1])
+
+    def _porosity(self, vacancy_ratio: float, rho: Floats, moments: Floats) -> float:
+        """See `observe.Observables`. Collective."""
+        g = self.scheme.lattice
+        means = []
+        for low, high in ((self.pack.low, self.pack.high), self.pack.now(moments)):
+            inside = [
+                np.ones((2, 1)) if axis is None else overlap(axis.points, axis.step, a, b)
+                for axis, a, b in zip(g.axes, along(low), along(high), strict=True)
+            ]
+            slow, middle, fast = (
+                part if axis is None else axis.sums(part) for axis, part in zip(g.axes, inside, strict=True)
+            )
+            solid = np.einsum("smf,ps,pm,pf->", rho, slow[:, g.owned], middle, fast, optimize=True)
+            volume = np.prod([part.sum(axis=1) for part in inside], axis=0).sum()
+            means.append(float(g.ranks.sum(np.array([solid]))[0] / volume))
+        return vacancy_ratio + means[0] - means[1]
+
+
+def along(corner: Floats) -> Floats:
+    """Coordinates in the order of a lattice's axes: slow, middle (0 in 2-D), fast."""
+    return corner[::-1] if len(corner) == 3 else np.insert(corner[::-1], 1, 0.0)
 
 
 def integrals(axis: Axis, low: float, high: float) -> Floats:

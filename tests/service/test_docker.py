@@ -310,5 +310,5 @@ def test_the_root_file_system_may_be_read_only(image: Image, data: Path) -> None
     command = ["unshare", "--mount", "--propagation", "private", "bash", "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | given)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads((data / "tiny" / "run.json").read_text())["state"] == "done"
+    assert json.loads((data / "tiny" / "run.json").read_text())["state"] == "succeeded"
     assert compiled(data / ".cache") == compiled(image.root / "opt" / "frit" / "compiled")

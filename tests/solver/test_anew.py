@@ -71,7 +71,7 @@ def test_the_case_alone_is_enough(tmp_path: Path) -> None:
     ended_ = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     assert ended_.returncode == 0, ended_.stderr
     assert "run has no checkpoint yet: it is begun anew from its case.json" in ended_.stderr
-    assert len(history(tmp_path / "run")) == 11
+    assert [row["step"] for row in history(tmp_path / "run") if row["step"] % 10 == 0] == list(range(0, 101, 10))
 
 
 @pytest.mark.parametrize(("text", "words"), [(None, "no case.json"), ('{"domain": ', "not valid JSON")])

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from launching import PAIR, Case, Tree, columns, different, launch, on_mesh, record, snapshots, solve, write_case
 
-from frit.sweeps.plots import plot_snapshot
+from frit.sweeps.pictures import draw_panels
 
 # Three particles, each touching both others, all of different size: rigid motion with rotation. 100 steps.
 TRIPLE: dict[int, Case] = {
@@ -176,7 +176,7 @@ def test_a_bad_state_on_one_rank_ends_all_with_time_and_place(tmp_path: Path) ->
     for words in ("step 1, at (", "rho = ", "likely cause: ", "good checkpoint is at t = 0, the last snapshot at 0.5"):
         assert words in ended["message"]
     assert snapshots(tmp_path / "run")["time"].tolist() == [0.0, 0.5]
-    plot_snapshot(tmp_path / "run", 0.5, tmp_path / "moment.png")
+    draw_panels(tmp_path / "run", [0.5], tmp_path / "moment.png")
     assert (tmp_path / "moment.png").stat().st_size > 10_000
     assert (tmp_path / "run/checkpoint.h5").exists()
 

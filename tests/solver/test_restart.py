@@ -144,7 +144,7 @@ def test_int_and_term_end_with_a_checkpoint(tmp_path: Path, number: signal.Signa
     directory = interrupted(PAIR, tmp_path / "run", ranks, step=20, number=number)
     assert checkpoint_step(directory) == 20
     assert "checkpoint at t = 0.002" in record(directory)["message"]
-    assert [row["step"] for row in history(directory)] == [0, 10, 20]
+    assert [row["step"] for row in history(directory) if row["step"] % 10 == 0] == [0, 10, 20]
 
 
 def test_progress_of_a_resumed_run_makes_nothing_up(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ if what in ("sleep", "deaf", "marching"):
     stop = time.monotonic() + float(rest[0])
     while time.monotonic() < stop:
         time.sleep(0.005)
-record("done")
+record("succeeded")
 """
 
 PAIR: dict[str, Any] = {

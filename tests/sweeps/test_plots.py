@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from matplotlib.image import imread
 from scipy.spatial import cKDTree
 
 from frit.solver.arrays import Floats
-from frit.sweeps import curves, plots
+from frit.sweeps import curves, plots, surface
+from frit.sweeps.pictures import COLOURS, Look, draw_panels, movie
 from frit.sweeps.plots import PlotError
+from frit.sweeps.ranking import Outcome, rank
 
 SIZE = [60.0, 36.0]
 CENTRES = np.array([[18.0, 18.0], [42.0, 18.0]])
@@ -128,10 +131,11 @@ def test_touching_particles_differ_in_colour() -> None:
 def test_section_shows_particles_boundary_and_vacancy(discs: Path) -> None:
     snapshot = plots.read_snapshot(discs, 5.0)
     colours = plots.particle_colours(snapshot.nodes, snapshot.first_owner)
-    x, y, rho, picture = plots.section(snapshot, colours, np.array(SIZE), (0, 1))
+    cut = plots.Section(snapshot.nodes, np.array(SIZE), (0, 1))
+    rho, picture = cut.shown(snapshot, colours)
 
     def at(px: float, py: float) -> Floats:
-        pixel: Floats = picture[np.argmin(abs(y - py)), np.argmin(abs(x - px))]
+        pixel: Floats = picture[np.argmin(abs(cut.y - py)), np.argmin(abs(cut.x - px))]
         return pixel
 
     np.testing.assert_allclose(at(18, 18), colours[0], atol=0.02)
@@ -147,7 +151,7 @@ def test_snapshot_nearest_in_time_is_drawn_and_the_store_left_as_it_was(discs: P
     before = {path: path.stat().st_mtime_ns for path in discs.rglob("*")}
     assert len(before) > 10
     assert plots.nearest_time(discs, 3.0) == 5.0
-    assert plots.plot_snapshot(discs, 3.0, discs / "s.png") == 5.0
+    assert draw_panels(discs, [3.0], discs / "s.png") == [5.0]
     assert {path: path.stat().st_mtime_ns for path in discs.rglob("*") if path.name != "s.png"} == before
     picture = imread(discs / "s.png")[..., :3]
     for colour in plots.PALETTE[:2]:
@@ -160,7 +164,7 @@ def test_three_sections_of_spheres(tmp_path: Path) -> None:
     write_case(tmp_path, size, "spheres")
     centres, radii = np.array([[4.5, 6, 5], [11.5, 6, 5]]), np.array([3.5, 3.5])
     write_snapshots(tmp_path, scattered(size, 1.0), centres, radii)
-    assert plots.plot_snapshot(tmp_path, 0.0, tmp_path / "s.png") == 0.0
+    assert draw_panels(tmp_path, [0.0], tmp_path / "s.png", Look(sections=True)) == [0.0]
     height, width = imread(tmp_path / "s.png").shape[:2]
     assert width > 2 * height
 
@@ -169,13 +173,13 @@ def test_particles_without_nodes_and_nodes_without_particles(tmp_path: Path) -> 
     """The last frame may be all vacancy; the colours do not need the particles to be there."""
     write_case(tmp_path, SIZE)
     write_snapshots(tmp_path, scattered(SIZE, 2.0), CENTRES, RADII, times=(0.0, -100.0))
-    assert plots.plot_snapshot(tmp_path, -100.0, tmp_path / "s.png") == -100.0
+    assert draw_panels(tmp_path, [-100.0], tmp_path / "s.png") == [-100.0]
 
 
 def test_missing_or_empty_snapshots_are_named(tmp_path: Path) -> None:
     write_case(tmp_path, SIZE)
     with pytest.raises(PlotError, match="no snapshots"):
-        plots.plot_snapshot(tmp_path, 0.0, tmp_path / "s.png")
+        draw_panels(tmp_path, [0.0], tmp_path / "s.png")
     zarr.create_group(tmp_path / "snapshots.zarr").create_array("time", data=np.empty(0))
     with pytest.raises(PlotError, match="no snapshots"):
         plots.nearest_time(tmp_path, 0.0)
@@ -184,9 +188,9 @@ def test_missing_or_empty_snapshots_are_named(tmp_path: Path) -> None:
 def test_a_name_is_never_a_formula_nor_a_page(tmp_path: Path) -> None:
     """Names come from whoever submits."""
     names = [r"$\frac{", "</script><script>alert(1)</script>", "_hidden", "$x$"]
-    made = [curves.Curve(name, {}, [0.0, 1.0], [0.3, 0.2]) for name in names]
-    curves.write(tmp_path / "a.png", "vacancy_ratio", made)
-    curves.write(tmp_path / "a.html", "vacancy_ratio", made)
+    made = [Outcome(name, name, "succeeded", {"a.b": name}, [0.0, 1.0], [0.3, 0.2]) for name in names]
+    curves.write(tmp_path / "a.png", "vacancy_ratio", rank(made))
+    curves.write(tmp_path / "a.html", "vacancy_ratio", rank(made))
     assert "alert(1)</script>" not in (tmp_path / "a.html").read_text()
 
 
@@ -200,3 +204,53 @@ def test_crowded_nodes_are_thinned_and_even_ones_are_not() -> None:
     assert len(kept) == len(paired) / 2
     near = np.asarray(cKDTree(kept).query(np.array([9.0, 6.0]), 9)[1])
     assert len(np.unique(kept[near, 0])) > 1
+
+
+@pytest.mark.parametrize("colour", COLOURS)
+def test_before_and_after_in_one_figure(discs: Path, colour: Any) -> None:
+    assert draw_panels(discs, [0.0, 4.9, 5.1], discs / "p.png", Look(colour)) == [0.0, 5.0], "each once"
+    height, width = imread(discs / "p.png").shape[:2]
+    assert width > 2 * height
+    picture = imread(discs / "p.png")[..., :3]
+    blank = (picture > 0.99).all(axis=-1).mean()
+    assert 0.1 < blank < 0.9
+
+
+def test_spheres_are_a_lit_surface(tmp_path: Path) -> None:
+    """Two spheres in two colours, each in many shades; nodes of a lattice, and scattered ones."""
+    size = [16.0, 12.0, 10.0]
+    centres, radii = np.array([[4.5, 6, 5], [11.5, 6, 5]]), np.array([3.5, 3.5])
+    places = np.stack(np.meshgrid(*(np.arange(s + 1) for s in size), indexing="ij"), axis=-1).reshape(-1, 3)
+    for name, nodes in (("lattice", places), ("scattered", scattered(size, 1.0))):
+        (tmp_path / name).mkdir()
+        write_case(tmp_path / name, size, "spheres")
+        write_snapshots(tmp_path / name, nodes, centres, radii)
+        snapshot = plots.read_snapshot(tmp_path / name, 0.0)
+        grid = surface.gridded(snapshot.nodes, snapshot.rho, snapshot.owner, np.array(size))
+        found = surface.seen(grid, np.array(size), np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]]))
+        solid = found.picture[..., 3] > 0
+        pixel = (found.extent[1] - found.extent[0]) * (found.extent[3] - found.extent[2]) / solid.size
+        area = solid.sum() * pixel
+        assert 1.2 * np.pi * 3.5**2 < area < 2.1 * np.pi * 3.5**2, "two discs, one partly behind the other"
+        red, green, blue = found.picture[solid, :3].T
+        assert not green.any()
+        assert (red > 0).mean() > 0.3
+        assert (blue > 0).mean() > 0.3
+        assert len(np.unique(red.round(2))) > 20, "shades"
+
+
+def test_a_time_far_from_any_snapshot_is_told(discs: Path) -> None:
+    assert plots.far_away(discs, 2.0) is None
+    assert plots.far_away(discs, 5.0) is None
+    assert plots.far_away(discs, 9.0) == (
+        "there is no snapshot near t = 9: the nearest is at t = 5; there are 0, 5"
+    )  # fmt: skip
+
+
+def test_all_snapshots_as_a_movie(discs: Path) -> None:
+    from PIL import Image
+
+    with Image.open(movie(discs, discs / "m.gif")) as made:
+        assert made.n_frames == 2  # type: ignore[attr-defined]
+    with pytest.raises(PlotError, match="at most 12"):
+        draw_panels(discs, [0.0] * 13, discs / "p.png")

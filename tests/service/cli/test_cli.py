@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 
 from frit.service.cli import main as cli
 from frit.service.jobs import launch
+from frit.solver.ended import read_run
 
 STAND_IN = """
 import json, os, signal, sys, time
@@ -71,7 +72,7 @@ elif act in ("waits", "stubborn"):
 else:
     for step in range(0 if fresh else 2, 4):
         row(step)
-    record("done")
+    record("succeeded")
 """
 
 CASE = """
@@ -118,9 +119,9 @@ def record(directory: Path, **entries: Any) -> Path:
 def test_run_ends_with_a_summary_and_0(folder: Path) -> None:
     result = frit("run", "two.toml", "--ranks", "2")
     assert result.exit_code == 0, result.output
-    assert (result.stderr, launch.read_record(folder / "runs/two")["ranks"]) == ("", 2)
+    assert (result.stderr, read_run(folder / "runs/two")["ranks"]) == ("", 2)
     words = result.stdout.split()
-    assert {"done", "0.3", "12", "runs/two"} <= set(words)
+    assert {"succeeded", "0.3", "12", "runs/two"} <= set(words)
     assert "0.3 -> 0.27" in result.stdout
 
 
@@ -130,7 +131,7 @@ def test_run_json_is_the_summary_and_nothing_else(folder: Path) -> None:
     assert summary.pop("wall_time") > 0
     assert summary.pop("time") == pytest.approx(0.3)
     assert summary == {
-        "state": "done",
+        "state": "succeeded",
         "message": None,
         "steps": 3,
         "evaluations": 12,
@@ -175,7 +176,7 @@ def test_run_leaves_another_run_alone(folder: Path) -> None:
     assert "no checkpoint" in result.stderr
     (before / "checkpoint.h5").touch()
     assert "frit resume runs/two" in frit("run", "two.toml").stderr
-    assert launch.read_record(before) == {"state": "failed"}
+    assert read_run(before) == {"state": "failed"}
 
 
 def test_a_refused_run_may_be_run_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,10 +208,10 @@ def test_resume_takes_the_ranks_of_before(folder: Path) -> None:
     directory = record(folder / "old", state="interrupted", ranks=2)
     (directory / "checkpoint.h5").touch()
     assert frit("resume", "old").exit_code == 0
-    assert launch.read_record(directory) == {"state": "done", "message": None, "ranks": 2}
+    assert read_run(directory) == {"state": "succeeded", "message": None, "ranks": 2}
     record(directory, state="interrupted", ranks=2)
     assert frit("resume", "old", "--ranks", "1").exit_code == 0
-    assert launch.read_record(directory)["ranks"] == 1
+    assert read_run(directory)["ranks"] == 1
 
 
 def test_resume_needs_a_checkpoint(folder: Path) -> None:

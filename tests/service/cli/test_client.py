@@ -227,3 +227,30 @@ def test_a_case_sent_back_is_the_same_case(idle: Client) -> None:
     job = job_of(idle.submit(TINY))
     assert parse_case(job.refresh().data["case"]) == parse_case(TINY)
     assert job_of(idle.submit(job.data["case"])).data["identity"] == job.data["identity"]
+
+
+def test_the_same_case_is_one_job_where_it_is_reused(idle: Client) -> None:
+    tree = {**TINY, "model": {"k": 61.0}}
+    first = job_of(idle.submit(tree))
+    assert job_of(idle.submit({**tree, "name": "other words"}, reuse=True)).id == first.id
+    assert job_of(idle.submit(tree)).id != first.id, "as before, unless it is asked for"
+    newest = job_of(idle.submit(tree, reuse=True)).cancel()
+    again = job_of(idle.submit(tree, reuse=True, recompute=True))
+    assert again.id != newest.id, "one that waits is of more use than one that was cancelled"
+    for job in idle.jobs(model__k=61):
+        if not job.final:
+            job.cancel()
+    assert job_of(idle.submit(tree, reuse=True)).state == "queued", "what was cancelled is tried again"
+    assert sum(1 for _ in idle.jobs(model__k=61)) == 2
+
+
+def test_histories_of_several_jobs_are_asked_for_within_limits(idle: Client) -> None:
+    one, two = (job_of(idle.submit(TINY)).id for _ in range(2))
+    assert idle.get("/v1/histories", params={"id": f"{two},{one}"}) == {
+        "histories": [{"job": two, "rows": []}, {"job": one, "rows": []}]
+    }
+    with pytest.raises(ProblemError, match="refused") as refused:
+        idle.get("/v1/histories", params={"id": ",".join([one] * 11), "rows": 10_000})
+    assert "at most 100 jobs, and at most 100000 rows together: 11 times 10000" in str(refused.value.problem)
+    with pytest.raises(ProblemError, match="there is none"):
+        idle.get("/v1/histories", params={"id": f"{one},ffff"})

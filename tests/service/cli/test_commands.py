@@ -31,7 +31,7 @@ main()
 # Long enough to be interrupted wherever it runs; nobody waits for its end.
 ENDLESS = {
     "time": {"integrator": "rk2", "end": 1000.0, "step": 1e-4},
-    "output": {"history_every": 0.001, "snapshots": [0.0, 1000.0]},
+    "output": {"history_every": 0.001, "history_change": 0, "snapshots": [0.0, 1000.0]},
 }
 SHOWN = re.compile(r"t [\d.e-]+/1000 step \d+ [\d.e+]+ ev/s live \d+% vacancy 0\.\d{4} [\d:, a-z]+ left")
 
@@ -51,6 +51,7 @@ step = 1e-4
 [output]
 history_every = 0.001
 snapshots = [0.0, 0.0035, 0.01]
+keep_checkpoint = true
 """
 
 
@@ -105,7 +106,7 @@ def test_run_ends_with_a_summary_and_nothing_else(folder: Path) -> None:
     rows = history(folder / "runs/pair")
     said = (folder / "said").read_text()
     words = dict(line.split(maxsplit=1) for line in said.splitlines())
-    assert (words["state"], words["steps"], words["evaluations"]) == ("done", "100", "200")
+    assert (words["state"], words["steps"], words["evaluations"]) == ("succeeded", "100", "200")
     assert words["directory"] == "runs/pair"
     assert said.count(f"{rows[0]['vacancy_ratio']:.6g} -> {rows[-1]['vacancy_ratio']:.6g}") == 1
     assert "\x1b" not in said
@@ -201,7 +202,7 @@ def test_resume_ends_like_an_undisturbed_run(folder: Path) -> None:
     status, out, err = frit(folder, "resume", "cut", "--json")
     assert (status, err) == (0, "")
     assert {key: json.loads(out)[key] for key in ("state", "steps", "directory")} == {
-        "state": "done",
+        "state": "succeeded",
         "steps": 100,
         "directory": "cut",
     }

@@ -146,8 +146,9 @@ def test_comparing_real_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     said = frit("compare", "surface", "--data", "data", "--out", "curves.csv")
     assert "packs of equal size" in said
     lines = (tmp_path / "curves.csv").read_text().splitlines()
-    assert lines[0] == "name,model.D_surf,time,vacancy_ratio"
-    assert len(lines) == 1 + 3 * 101
+    assert lines[0] == "job,name,model.D_surf,time,vacancy_ratio"
+    assert len(lines) > 3 * 101
+    assert "lowest vacancy ratio: D surf" in said
     for name in ("curves.png", "curves.html"):
         frit("compare", "surface", "--data", "data", "--out", name)
         assert (tmp_path / name).stat().st_size > 10_000

@@ -561,7 +561,8 @@ def test_the_document_of_the_interface_is_complete(idle: TestClient) -> None:
         "/v1/jobs", "/v1/jobs/{id}", "/v1/jobs/{id}/history", "/v1/jobs/{id}/log", "/v1/jobs/{id}/events",
         "/v1/jobs/{id}/snapshots", "/v1/jobs/{id}/snapshots.zarr/{path}", "/v1/jobs/{id}/cancel", "/v1/jobs/{id}/retry",
         "/v1/jobs/{id}/rerun", "/v1/sweeps", "/v1/sweeps/{id}", "/v1/sweeps/{id}/compare", "/v1/sweeps/{id}/cancel",
-        "/v1/sweeps/{id}/retry", "/v1/files", "/v1/files/{id}", "/v1/plan", "/v1/schema", "/v1/events", "/v1/limits",
+        "/v1/sweeps/{id}/retry", "/v1/histories", "/v1/files", "/v1/files/{id}",
+        "/v1/plan", "/v1/schema", "/v1/events", "/v1/limits",
     }  # fmt: skip
     assert {"/livez", "/readyz", "/metrics"} <= paths.keys()
     for path, operations in paths.items():

@@ -12,6 +12,7 @@ import pytest
 
 from frit.service.jobs import launch
 from frit.service.jobs.launch import Launch, LaunchError
+from frit.solver.ended import read_run
 
 STAND_IN = """
 import json, os, signal, sys, time
@@ -49,7 +50,7 @@ if act == "steps":
     say(environment={key: os.environ.get(key) for key in keys})
     for step in range(3):
         say(time=0.5 * step)
-    record("done")
+    record("succeeded")
 elif act == "says no":
     record("failed", "NaN at step 7")
     sys.exit(1)
@@ -170,7 +171,7 @@ def test_progress_stray_lines_and_a_good_end(run: Path, monkeypatch: pytest.Monk
         outcome = started.wait()
     environment = {"OMP_NUM_THREADS": "1", "SLURM_STEP_ID": None, "PMI_SIZE": "2"}
     assert progress == [{"environment": environment}, {"time": 0.0}, {"time": 0.5}, {"time": 1.0}]
-    assert (outcome.state, outcome.message, outcome.returncode) == ("done", None, 0)
+    assert (outcome.state, outcome.message, outcome.returncode) == ("succeeded", None, 0)
     assert {"a stray line", "a word on stderr"} <= set(outcome.errors.splitlines())
 
 
@@ -265,6 +266,11 @@ def test_a_refusal_that_leaves_the_record_alone(run: Path) -> None:
 
 
 def test_a_torn_or_missing_record_is_empty(tmp_path: Path) -> None:
-    assert launch.read_record(tmp_path) == {}
+    assert read_run(tmp_path) == {}
     (tmp_path / "run.json").write_text('{"state": "do')
-    assert launch.read_record(tmp_path) == {}
+    assert read_run(tmp_path) == {}
+
+
+def test_words_of_earlier_versions_are_understood(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"state": "done", "ranks": 2}')
+    assert read_run(tmp_path) == {"state": "succeeded", "ranks": 2}

@@ -31,8 +31,8 @@ from frit.solver.durable import read_json, write_json
 @pytest.mark.parametrize(
     ("outcome", "reason", "move"),
     [
-        (Outcome("done", None, 0, ""), None, Move.SUCCEED),
-        (Outcome("done", None, 0, ""), "cancelled", Move.SUCCEED),  # it was quicker than the wish
+        (Outcome("succeeded", None, 0, ""), None, Move.SUCCEED),
+        (Outcome("succeeded", None, 0, ""), "cancelled", Move.SUCCEED),  # it was quicker than the wish
         (Outcome("interrupted", "checkpoint at t = 1", 130, ""), "cancelled", Move.STOP),
         (Outcome("interrupted", "checkpoint at t = 1", 130, ""), "timed_out", Move.TIME_OUT),
         (Outcome("interrupted", "checkpoint at t = 1", 130, ""), "released", Move.RELEASE),

@@ -165,7 +165,7 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> tuple[Case
         raise CheckpointError(f"{directory}: no {checkpoint.NAME} to resume from, and no {path.name} to begin with")
     output.remove_torn(directory)
     if resumed:
-        return load_case(path), not kept
+        return load_case(path, kept=True), not kept
     case = load_case(arguments.case)
     output.write_text(path, case.resolved_json())
     return case, True

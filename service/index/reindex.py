@@ -273,7 +273,7 @@ def job_of(directory: Path) -> Row:
     record = json.loads((directory / "job.json").read_text())
     case = (directory / "submitted.json").read_text()
     keys = ("name", "ranks", "priority", "tags", "time_limit", "created")
-    identity = record.get("identity") or parse_case(json.loads(case)).identity()
+    identity = record.get("identity") or parse_case(json.loads(case), kept=True).identity()
     row = {"seq": record.get("seq"), "id": directory.name, "identity": identity, "case": case}
     row |= {key: record.get(key) for key in ("owner", "origin")}
     return row | {key: record[key] for key in keys}

@@ -8,7 +8,6 @@ import json
 import math
 import os
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -18,11 +17,11 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from ..jobs.child import die_with
 from ..jobs.launch import Launch, LaunchError, Outcome, read_record
 from . import compare, index, jobs, serve, service, sweep, token
-from .terminal import AsJson, cell, in_words, refuse
+from .terminal import AsJson, Shown, cell, in_words, refuse
 
 EXIT = {"done": 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
@@ -202,16 +201,19 @@ def check_case(path: Path) -> None:
 
 def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, profile: bool = False) -> NoReturn:
     """Launch the solver, show its progress to the end, and leave with the exit status of its outcome."""
+    if ranks > (cores := len(os.sched_getaffinity(0))):
+        typer.echo(f"--ranks {ranks}: there are {cores} cores; ranks that share one wait for each other", err=True)
     try:
-        launch = Launch(ranks, arguments, directory)
+        tied = die_with(os.getpid(), signal.SIGTERM)  # killed without a word, it leaves a checkpoint all the same
+        launch = Launch(ranks, arguments, directory, first=tied)
     except (LaunchError, OSError) as error:
         refuse(str(error))
     start, progress = monotonic(), dict[str, Any]()
-    with launch, progress_bar() as (bar, task), signals_passed_on(launch, bar, task):
-        for progress in launch:
-            bar.update(task, completed=progress.get("time"), total=progress.get("end"))
+    with launch, Shown() as shown, signals_passed_on(launch, shown):
+        for line in launch:
             if not launch.stopping:
-                bar.update(task, description=in_words(progress))
+                shown.tell(in_words(line), line.get("time"), line.get("end"))
+            progress = line if "time" in line else progress
         outcome = launch.wait()
     report(directory, outcome, progress, monotonic() - start, as_json)
     if profile and (seconds := read_record(directory).get("profile")):
@@ -222,14 +224,15 @@ def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, pro
 
 
 @contextmanager
-def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[None]:
+def signals_passed_on(launch: Launch, shown: Shown) -> Iterator[None]:
     """INT, TERM, HUP: one TERM to the ranks; a second INT kills. What nohup or & had ignored stays so."""
 
     def handle(number: int, _: object) -> None:
         if launch.stopping and number == signal.SIGINT:
             launch.kill()
         launch.stop(GRACE)
-        bar.update(task, description="writing a checkpoint; Ctrl-C again kills")
+        keeps = "writing a checkpoint" if launch.marches else "stopping"
+        shown.tell(f"{keeps}; Ctrl-C again kills")
 
     before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
@@ -240,15 +243,6 @@ def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[N
     finally:
         for number in heard:
             signal.signal(number, before[number])
-
-
-@contextmanager
-def progress_bar() -> Iterator[tuple[Progress, TaskID]]:
-    """On stderr, and only where somebody sees it."""
-    seen = sys.stdout.isatty() and sys.stderr.isatty()
-    text = TextColumn("{task.description}", markup=False)
-    with Progress(BarColumn(bar_width=12), text, console=Console(stderr=True), disable=not seen) as bar:
-        yield bar, bar.add_task("starting", total=None)
 
 
 def report(

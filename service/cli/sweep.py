@@ -3,24 +3,20 @@
 import asyncio
 import json
 import signal
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
 
 from frit.solver.characters import visible
 
 from .speaking import HERE, Secret, SweepId, Url, row, speaking, tell, tell_rows
-from .terminal import AsJson, DataFolder, Recompute, SweepFile, in_words, of_older, refuse, show_table
+from .terminal import AsJson, DataFolder, Recompute, Shown, SweepFile, of_older, refuse, show_table
 
 app = typer.Typer(no_args_is_help=True, help="Sweeps: their cost, running them without a server, those of a service.")
-
-WIDEST = 44  # characters of a name in a table
 
 
 @app.command()
@@ -149,19 +145,20 @@ async def run_here(
 
 
 async def follow(engine: Any, sweep: str) -> bool:
-    """Show one line per running job until all are final; True where Ctrl-C came before."""
+    """Show one line for all jobs until they are final; True where Ctrl-C came before."""
     stop = asyncio.Event()
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live, stopping(stop):
+    with Shown() as shown, stopping(stop):
         while True:
             seen = engine.notifier.count
             points = engine.store.sweep_points(sweep)
-            if live.console.is_terminal:
-                live.update(lines(points, engine.progress, stop.is_set()), refresh=True)
+            states = Counter(point.job.state.value for point in points)
+            running = [engine.progress(point.job.id) for point in points if point.job.state.active]
+            shown.tell_all(states, running, sum(point.job.final for point in points))
             if all(point.job.final for point in points):
                 return False
             if stop.is_set():
-                releasing = asyncio.create_task(engine.scheduler.release())
-                await releasing
+                shown.tell("writing checkpoints")
+                await engine.scheduler.release()
                 return True
             await engine.notifier.wait(1.0, seen)
 
@@ -178,18 +175,6 @@ def stopping(stop: asyncio.Event) -> Iterator[None]:
     finally:
         for number in heard:
             loop.remove_signal_handler(number)
-
-
-def lines(points: Any, progress: Any, stopping: bool) -> Table:
-    """How many are done, and where each running job is."""
-    table = Table.grid(padding=(0, 1))
-    done = sum(point.job.final for point in points)
-    table.add_row(f"{done} of {len(points)} done", "writing checkpoints" if stopping else "")
-    for point in points:
-        if point.job.state.active:
-            now = progress(point.job.id)
-            table.add_row(point.name[:WIDEST], in_words(now) if now else point.job.state.value)
-    return table
 
 
 def rows_of(store: Any, sweep: str) -> list[dict[str, Any]]:

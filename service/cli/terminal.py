@@ -26,6 +26,12 @@ Recompute = Annotated[
 ]
 
 
+def must_be_there(data: Path) -> None:
+    """Refuse a data folder that somebody named and that is not there; the default one may not have been made yet."""
+    if not data.is_dir() and data != Path("data"):
+        refuse(f"--data {data}: there is no such folder")
+
+
 def of_older(revisions: Sequence[int | None]) -> str | None:
     """A sentence on the jobs that an older revision of the solver computed; None stands for each of the others."""
     found = [revision for revision in revisions if revision is not None]

@@ -2,16 +2,20 @@
 
 import json
 import re
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
+from rich.console import Group
+from rich.live import Live
 
 from frit.solver.characters import visible
 
 from .speaking import HERE, JobId, Secret, Url, find_job, jobs_of, row, speaking, sweeps_of, tell, tell_rows
-from .terminal import AsJson, Recompute, Shown, SweepFile, in_words, refuse, show_table
+from .terminal import AsJson, Recompute, Shown, SweepFile, in_words, refuse, show_table, table_of
 
 if TYPE_CHECKING:
     from ..client import Client
@@ -108,6 +112,46 @@ def jobs(
         else:
             shown = f"no job fits {' '.join(where)}" if where else "no jobs yet"
             show_table([row(job) for job in found], shown)
+
+
+def top(
+    every: Annotated[float, typer.Option(metavar="SECONDS", min=0.2, help="Between two looks.")] = 2.0,
+    once: Annotated[bool, typer.Option("--once", help="Look once, and end.")] = False,
+    url: Url = HERE,
+    token: Secret = None,
+) -> None:
+    """Watch what runs: jobs, cores, speed, time left. Ctrl-C ends it."""
+    with speaking(url, token) as client:
+        if once or not sys.stdout.isatty():
+            typer.echo(summary_of(found := going(client), client))
+            show_table([busy_row(job) for job in found])
+            return
+        with Live(screen=True, auto_refresh=False) as live:
+            while True:
+                found = going(client)
+                live.update(Group(summary_of(found, client), table_of([busy_row(job) for job in found])), refresh=True)
+                time.sleep(every)
+
+
+def going(client: "Client") -> "list[RemoteJob]":
+    """What has not ended: what runs first."""
+    now = [*client.jobs(state="starting,running", limit=200)]
+    return [*now, *islice(client.jobs(state="queued", order="created", limit=20), 20)]
+
+
+def summary_of(found: "Sequence[RemoteJob]", client: "Client") -> str:
+    """Cores that are in use, jobs that run."""
+    running = [job for job in found if job.state != "queued"]
+    return f"{sum(job.data['ranks'] for job in running)} of {client.limits()['cores']} cores, {len(running)} jobs run"
+
+
+def busy_row(job: "RemoteJob") -> dict[str, Any]:
+    """Of the table of what runs."""
+    shown, speed = row(job), (job.progress or {}).get("evaluations_per_second")
+    return {
+        **{key: shown[key] for key in ("id", "state", "name", "ranks", "done", "left")},
+        "evaluations_per_second": speed, "vacancy_ratio": (job.progress or {}).get("vacancy_ratio"),
+    }  # fmt: skip
 
 
 def filters_of(words: Iterable[str]) -> dict[str, Any]:

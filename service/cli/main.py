@@ -8,7 +8,7 @@ import json
 import math
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -30,14 +30,9 @@ app = typer.Typer(
     name="frit",
     help="Meshfree phase-field sintering of metal particles.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
-app.add_typer(index.db, name="db")
-app.command()(index.reindex)
-app.add_typer(sweep.app, name="sweep")
-app.add_typer(token.app, name="token")
-app.add_typer(service.files, name="files")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -57,6 +52,12 @@ def main() -> None:
     app()
 
 
+def group(panel: str, *commands: tuple[str, Callable[..., Any], str]) -> None:
+    """Commands under one heading of the help, each with an example."""
+    for name, function, example in commands:
+        app.command(name, rich_help_panel=panel, epilog=f"Example: {example}")(function)
+
+
 def show_version(wanted: bool) -> None:
     """Option callback."""
     if wanted:
@@ -74,7 +75,6 @@ def frit(
     """Options before the command."""
 
 
-@app.command()
 def run(
     case: CaseFile,
     ranks: Ranks = 1,
@@ -95,7 +95,6 @@ def run(
     follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json, profile)
 
 
-@app.command()
 def resume(
     directory: RunDirectory,
     ranks: Annotated[
@@ -117,7 +116,6 @@ def resume(
     follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
 
 
-@app.command()
 def plot(
     directory: RunDirectory,
     time: Annotated[
@@ -144,13 +142,6 @@ def plot(
         refuse(str(error))
 
 
-for command in (serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
-                jobs.change, jobs.gc, compare.compare, service.plan, service.limits, service.events):  # fmt: skip
-    app.command()(command)
-app.command("rm")(jobs.remove)
-
-
-@app.command("pack")
 def pack_only(
     case: CaseFile,
     out: Annotated[Path, typer.Option(metavar="FILE.csv", dir_okay=False, help="Particles: x,y[,z],radius, nm.")],
@@ -178,7 +169,6 @@ def pack_only(
     typer.echo(f"{out}, {picture}")
 
 
-@app.command()
 def schema() -> None:
     """JSON Schema of the case file."""
     from frit.solver.case import case_schema
@@ -194,6 +184,45 @@ def check_case(path: Path) -> None:
         load_case(path)
     except CaseError as error:
         refuse(*(f"{path}: {line}" for line in str(error).splitlines()))
+
+
+# --- the commands, those most used first -------------------------------------------------------------
+
+group(
+    "Run a case here",
+    ("run", run, "frit run case.toml --ranks 2"),
+    ("resume", resume, "frit resume runs/case"),
+    ("plot", plot, "frit plot runs/case --time 5"),
+    ("pack", pack_only, "frit pack case.toml --out particles.csv"),
+    ("schema", schema, "frit schema > case.schema.json"),
+)
+app.add_typer(sweep.app, name="sweep", rich_help_panel=(SWEEPS := "Sweeps"))
+group(SWEEPS, ("compare", compare.compare, 'frit compare "density by spread" --data data --out curves.png'))
+group(
+    "The service",
+    ("serve", serve.serve, "frit serve --data data --cores 8"),
+    ("submit", jobs.submit, "frit submit density.toml --wait"),
+    ("jobs", jobs.jobs, "frit jobs state=running particles.mean_radius.ge=9"),
+    ("top", jobs.top, "frit top"),
+    ("show", jobs.show, "frit show 3fa9"),
+    ("log", jobs.log, "frit log 3fa9 -f"),
+    ("cancel", jobs.cancel, "frit cancel 3fa9"),
+    ("retry", jobs.retry, "frit retry 3fa9"),
+    ("rerun", jobs.rerun, "frit rerun 3fa9"),
+    ("change", jobs.change, "frit change 3fa9 --priority 5 --tag urgent"),
+    ("plan", service.plan, "frit plan density.toml"),
+    ("limits", service.limits, "frit limits"),
+    ("events", service.events, "frit events --since 0"),
+)
+app.add_typer(token.app, name="token", rich_help_panel="The service")
+group(
+    DATA := "Data",
+    ("rm", jobs.remove, "frit rm 3fa9 s2"),
+    ("gc", jobs.gc, "frit gc --keep 30d --keep succeeded"),
+    ("reindex", index.reindex, "frit reindex --data data"),
+)
+app.add_typer(service.files, name="files", rich_help_panel=DATA)
+app.add_typer(index.db, name="db", rich_help_panel=DATA)
 
 
 # --- following a launch ---------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ def speaking(url: str, token: str | None, file: str | None = None) -> "Iterator[
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except ProblemError as error:
-        lines = [str(error), *(wrong_field(wrong) for wrong in error.problem.get("errors", ()))]
+        lines = [wrong_field(wrong) for wrong in error.problem.get("errors", ())] or [str(error)]
         (refuse if error.status < 500 else fail)(*lines)
     except httpx2.TransportError as error:
         fail(f"no service answers at {url}: {error}; `frit serve` starts one")
@@ -90,8 +90,9 @@ def newest(kind: str, wanted: str, found: "list[Found]", there: "Iterator[Found]
 
 def wrong_field(wrong: dict[str, Any]) -> str:
     """A line for one wrong field of a problem."""
-    where = wrong.get("pointer") or wrong.get("parameter") or ""
-    return f"{where} = {wrong.get('value')!r}: {wrong.get('detail')}"
+    where = wrong.get("pointer") or wrong.get("parameter") or "the request"
+    value = "" if wrong.get("value") is None else f" = {wrong['value']!r}"
+    return f"{where}{value}: {wrong.get('detail')}"
 
 
 def row(job: "RemoteJob") -> dict[str, Any]:

@@ -175,7 +175,7 @@ class Book:
         known = {row["id"] for row in self.jobs.values()}
         lost = {row["id"] for row in self.gone.values()} - known
         found = []
-        for directory in sorted(runs.iterdir()) if runs.exists() else []:
+        for directory in sorted(path for path in runs.glob("*") if path.is_dir()):
             if directory.name in lost:  # a crash came before all of it was deleted
                 shutil.rmtree(directory, ignore_errors=True)
             elif directory.name not in known:

@@ -20,6 +20,7 @@ from .remote import LONGEST_PAUSE, RemoteJob, RemoteSweep
 
 QUIET = 60.0  # seconds without a sign of life of a stream before it is opened anew; signs come every 15
 PASSING = (502, 503, 504)
+HERE = "http://127.0.0.1:8000"
 LARGE = 5_000_000  # bytes of a file that is not sent along with a case, but before it
 
 Tree = dict[str, Any]
@@ -54,13 +55,16 @@ class Client:
     Problem = ProblemError
 
     def __init__(
-        self, url: str = "http://127.0.0.1:8000", token: str | None = None, *, timeout: float = 30.0,
-        patience: float = 60.0,
-    ) -> None:  # fmt: skip
-        """timeout: seconds for one answer; patience: seconds for which what fails on the way is tried again."""
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self.url, self.patience = url.rstrip("/"), patience
-        self._http = httpx2.Client(base_url=self.url, headers=headers, timeout=timeout)
+        self, url: str | None = None, token: str | None = None, *, timeout: float = 30.0, patience: float = 60.0
+    ) -> None:
+        """url: of the environment's FRIT_URL, else this machine's port 8000; token: of FRIT_TOKEN, where that is set.
+
+        timeout: seconds for one answer; patience: seconds for which what fails on the way is tried again.
+        """
+        token = token or os.environ.get("FRIT_TOKEN")
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self.url, self.patience = (url or os.environ.get("FRIT_URL") or HERE).rstrip("/"), patience
+        self._http = httpx2.Client(base_url=self.url, headers=self._headers, timeout=timeout)
 
     def __enter__(self) -> Self:
         return self
@@ -71,6 +75,10 @@ class Client:
     def close(self) -> None:
         """Close the connections."""
         self._http.close()
+
+    def storage_options(self) -> Tree:
+        """What zarr and xarray need to open the address of a store here."""
+        return {"headers": self._headers} if self._headers else {}
 
     # --- submitting ---------------------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """Jobs and sweeps of a service, as a script holds them."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -112,12 +112,28 @@ class RemoteJob(Remote):
         """What zarr and xarray open: `xarray.open_zarr(job.zarr_url)`."""
         return f"{self.client.url}{self.path}/snapshots.zarr"
 
-    def wait(self, timeout: float | None = None) -> Self:
-        """Until it is final, whatever it then is: see `state`. Raises `TimeoutError` after that many seconds."""
+    def wait(self, timeout: float | None = None, tell: "Callable[[Self], None]" = lambda _: None) -> Self:
+        """Until it is final, whatever it then is: see `state`. Raises `TimeoutError` after that many seconds.
+
+        tell: called after each look, say to show `progress`.
+        """
         for _ in looks(timeout, f"job {self.id}"):
-            if self.refresh().final:
+            tell(self.refresh())
+            if self.final:
                 break
         return self
+
+    @property
+    def progress(self) -> Tree | None:
+        """The last line of progress while it runs."""
+        progress: Tree | None = self.data["progress"]
+        return progress
+
+    def open_zarr(self, **options: Any) -> Any:
+        """The snapshots as an xarray Dataset, lazily read, with the token of the client; options: of `open_zarr`."""
+        import xarray
+
+        return xarray.open_zarr(self.zarr_url, storage_options=self.client.storage_options(), **options)
 
     def history(self) -> "pd.DataFrame":
         """The history rows so far, a column per key."""
@@ -181,10 +197,12 @@ class RemoteSweep(Remote):
         """Its jobs, in the order of their submission."""
         return self.client.jobs(sweep=self.id, **{"order": "created", **filters})
 
-    def wait(self, timeout: float | None = None) -> Self:
-        """Until every job is final. Raises `TimeoutError` after that many seconds."""
+    def wait(self, timeout: float | None = None, tell: "Callable[[Self], None]" = lambda _: None) -> Self:
+        """Until every job is final. Raises `TimeoutError` after that many seconds. tell: called after each look."""
         for _ in looks(timeout, f"sweep {self.id}"):
-            if not self._unfinished():
+            going = self._unfinished()
+            tell(self)
+            if not going:
                 break
         return self.refresh()
 

@@ -7,16 +7,17 @@ running, succeeded, failed, interrupted, refused), because MPI libraries differ 
 
 import argparse
 import json
+import os
 import platform
 import signal
 import socket
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -36,6 +37,7 @@ from .run import Ending, RunError, piled_up, run
 from .setup import Setup, make_setup
 from .shape import ShapeError
 from .system import Progress, System
+from .telling import Teller, add_to_log
 
 REFUSALS = (CaseError, MeshError, ShapeError, CheckpointError, ParticleFileError, output.DirectoryError)
 PROGRESS_EVERY = 0.25  # seconds between two progress lines
@@ -50,8 +52,9 @@ def main() -> int:
     arguments = read_arguments()
     requests, ranks = Requests(), Ranks.world()
     directory = Path(arguments.resume or arguments.out)
+    teller = Teller(directory, ranks.root, arguments.progress)
     try:
-        state, message = execute(arguments, ranks, directory, requests)
+        state, message = execute(arguments, ranks, requests, teller)
     except BaseException as error:
         return give_up(error, ranks, directory)
     profile = [entry[0] for entry in ranks.everyones(np.array([ranks.watch.read()], dtype=object))]
@@ -75,15 +78,12 @@ def read_arguments() -> argparse.Namespace:
     return arguments
 
 
-class StopError(Exception):
-    """The end was asked for where there is nothing to keep."""
-
-
 class Requests:
     """What signals have asked for: a checkpoint (USR1), or the end (TERM, INT). Heard from the start of `main`."""
 
     def __init__(self) -> None:
         self.checkpoint = self.end = False
+        self.early: Callable[[], NoReturn] | None = None  # ends a run that has nothing to keep yet
         for number in (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._note)
 
@@ -92,35 +92,50 @@ class Requests:
             self.checkpoint = True
         else:
             self.end = True
+            if self.early is not None:
+                self.early()
 
-    def heed(self) -> None:
-        """Raises `StopError` once the end was asked for."""
-        if self.end:
-            raise StopError
+
+def leave(directory: Path, root: bool) -> NoReturn:
+    """End this process, and so all ranks, before the first step: at once, as compiling would take its time.
+
+    Rank 0 writes that down, or another one where it waits for the others.
+    """
+    if not root:
+        time.sleep(SPOKEN)
+    if root or output.read_state(directory) != "interrupted":
+        record_end(directory, "interrupted", "stopped before the first step")
+    os._exit(EXIT_STATUS["interrupted"])
 
 
 def execute(
-    arguments: argparse.Namespace, ranks: Ranks, directory: Path, requests: Requests
+    arguments: argparse.Namespace, ranks: Ranks, requests: Requests, teller: Teller
 ) -> tuple[str, str | None]:
     """The whole run: how it ended, and a message where it did not end well."""
+    directory = teller.directory
     asked, fresh = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
-    placed = ranks.from_root(place_or_stop(asked, directory, fresh, requests) if ranks.root else None)
-    if placed is None:
-        return "interrupted", "while the particles were packed: nothing is kept yet"
-    case, packing = placed
+    teller.owned, requests.early = True, lambda: leave(directory, ranks.root)
+    if requests.end:
+        leave(directory, ranks.root)
+    teller.phase("start" if fresh else "resumed", f"{asked.name}, {ranks.size} ranks")
+    if asked.particles.source == "packing" and fresh:
+        teller.phase("packing")
+    case, packing = ranks.from_root(place(asked, directory, fresh) if ranks.root else None)
+    teller.phase("set-up")
     rows = fresh or ranks.from_root(checkpoint.by_rows(directory) if ranks.root else None)
     setup, identity = make_setup(case, ranks, rows), asked.identity()
     kept = None if fresh else setup.read(directory, identity)
     scheme, state, integrator = setup.start(kept)
     if ranks.root:
         record_start(directory, asked, ranks.size, fresh, packing)
+        teller.log(f"{setup.nodes} nodes")
         if fresh and arguments.resume is not None:
             record_note(directory, ANEW)
         for remark in setup.remarks() if fresh else ():
             record_note(directory, remark)
     while True:
         wall_time = kept.wall_time if kept else None
-        recorder = Recorder(directory, setup, scheme, state, identity, wall_time, requests, arguments.progress)
+        recorder = Recorder(directory, setup, scheme, state, identity, wall_time, requests, teller)
         try:
             ending = run(scheme, state, integrator, recorder)
             if ending is not Ending.DONE or case.output.keep_checkpoint:
@@ -139,16 +154,6 @@ def execute(
         ranks.watch.enter("set-up")
         kept = setup.read(directory, identity)
         scheme, state, integrator = setup.start(kept)
-
-
-def place_or_stop(
-    asked: Case, directory: Path, fresh: bool, requests: Requests
-) -> tuple[Case, dict[str, Any] | None] | None:
-    """Rank 0: the case with its particles and what they are like (see `place`); None: the end was asked for."""
-    try:
-        return place(asked, directory, fresh, requests.heed)
-    except StopError:
-        return None
 
 
 def open_directory(arguments: argparse.Namespace, directory: Path) -> tuple[Case, bool]:
@@ -171,7 +176,7 @@ def open_directory(arguments: argparse.Namespace, directory: Path) -> tuple[Case
     if resumed and not kept and read_run(directory).get("state") == SUCCEEDED:
         raise output.DirectoryError(f"{directory}: has come to its end already; there is nothing to go on with")
     if resumed:
-        return load_case(path), not kept
+        return load_case(path, kept=True), not kept
     case = load_case(arguments.case)
     output.write_text(path, case.resolved_json())
     return case, True
@@ -189,12 +194,12 @@ class Recorder:
         identity: str,
         wall_time: float | None,
         requests: Requests,
-        progress: bool,
+        teller: Teller,
     ) -> None:
         """identity: of the case as asked; wall_time: seconds that a resumed run has taken before, None: a fresh run."""
         case, self.ranks, self.identity = system.case, system.ranks, identity
         fresh = wall_time is None
-        self.directory, self.setup, self.requests, self.progress = directory, setup, requests, progress
+        self.directory, self.setup, self.requests, self.teller = directory, setup, requests, teller
         self.began = time.monotonic() - (wall_time or 0.0)
         self.collector = Collector(setup.share(system), output.block_size(directory, setup.nodes, self.ranks, fresh))
         self.observables = setup.rows(system, state)
@@ -234,6 +239,9 @@ class Recorder:
         """A row where the vacancy ratio has moved; a checkpoint when it is time or somebody asks; True when somebody
         asks for the end.
         """
+        if state.step and self.requests.early is not None:
+            self.requests.early = None
+            self.teller.phase("steps", f"compiled for {c:.1f} s" if (c := self.teller.compiled) else "")
         due = time.monotonic() - self.checkpoint_clock >= system.case.output.checkpoint_every
         wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end, self._moved(system, state)]
         due, asked, stop, moved = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
@@ -261,6 +269,7 @@ class Recorder:
         }  # fmt: skip
         self.setup.keep(self.directory, system, state, self.collector, notes)
         self.checkpoint_time, self.checkpoint_clock = state.time, time.monotonic()
+        self.teller.log(f"checkpoint at t = {state.time:.6g}")
         self.requests.checkpoint = False
 
     def close(self) -> None:
@@ -274,7 +283,7 @@ class Recorder:
     def _show(self, system: System, state: Progress) -> None:
         """Print a progress line, at most four a second."""
         clock = time.monotonic()
-        if not (self.progress and self.ranks.root) or clock - self.shown < PROGRESS_EVERY:
+        if not (self.ranks.root and state.step) or self.requests.end or clock - self.shown < PROGRESS_EVERY:
             return
         self.shown = clock
         began, time_0, evaluations_0 = self.started
@@ -286,8 +295,10 @@ class Recorder:
             "live_fraction": self.latest.get("live_fraction"),
             "vacancy_ratio": self.latest.get("vacancy_ratio"),
             "remaining": (end - state.time) / speed if speed > 0.0 else None,
+            "compiled": round(self.teller.compiled, 3),
         }  # fmt: skip
-        print(json.dumps(line), flush=True)
+        self.teller.show(line)
+        self.teller.steps(line)
 
 
 def record_start(
@@ -350,12 +361,6 @@ def record_note(directory: Path, note: str) -> None:
     record: dict[str, Any] = json.loads(path.read_text())
     output.write_json(path, record | {"notes": [*record["notes"], note]})
     add_to_log(directory, f"note: {note}")
-
-
-def add_to_log(directory: Path, line: str) -> None:
-    """A line of log.txt, with the time."""
-    with open(directory / "log.txt", "a") as log:
-        log.write(f"{output.now()} {line}\n")
 
 
 def versions() -> dict[str, str]:

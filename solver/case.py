@@ -41,7 +41,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
-from . import amounts, overlaps, particle_file
+from . import amounts, overlaps, particle_file, resolution
 from .arrays import Flags, Floats
 from .characters import UNSHOWABLE
 from .particle_file import ParticleFileError
@@ -623,8 +623,8 @@ class Case(Table):
         return table
 
     @model_validator(mode="after")
-    def _tables_agree(self) -> Self:
-        _refuse(disagreements(self))
+    def _tables_agree(self, info: ValidationInfo) -> Self:
+        _refuse(disagreements(self, kept=bool((info.context or {}).get("kept"))))
         return self
 
     def with_particles(self, centres: ArrayLike, radii: ArrayLike) -> "Case":
@@ -634,7 +634,7 @@ class Case(Table):
             "radii": np.asarray(radii, dtype=float).tolist(),
             "interface_width": self.particles.interface_width,
         }
-        return parse_case({**self.tree(), "particles": spheres})
+        return parse_case({**self.tree(), "particles": spheres}, kept=True)
 
     def tables(self) -> dict[str, Table]:
         """All that has a table of its own, in the order of the case file."""
@@ -717,15 +717,16 @@ def wrong_dimensions(table: Table, dim: int) -> Iterator[Problem]:
                 yield Problem(f"{field}[{i}]", list(point), f"must be {dim} numbers, as domain.size is")
 
 
-def disagreements(case: Case, agreed: bool = False) -> Iterator[Problem]:
+def disagreements(case: Case, agreed: bool = False, kept: bool = False) -> Iterator[Problem]:
     """What is wrong between tables that are right by themselves.
 
-    agreed: particles, domain and boxes are known to fit.
+    agreed: particles, domain and boxes are known to fit; kept: the case was accepted before, maybe by fewer rules.
     """
     if case.particles.source == "list" and not agreed:
         yield from _particles_inside(case)
         yield from _particles_apart(case)
     yield from _particles_resolved(case)
+    yield from _interface_held(case, kept)
     yield from _points_of_their_own(case)
     if not agreed:
         yield from _boxes_inside(case)
@@ -794,6 +795,23 @@ def _particles_resolved(case: Case) -> Iterator[Problem]:
         smallest, what = given.smallest(), "the smallest radius or half edge"
     if spacing is not None and spacing > smallest:
         yield Problem("nodes.spacing", spacing, f"must be at most {what}, {smallest}")
+
+
+def _interface_held(case: Case, kept: bool) -> Iterator[Problem]:
+    """Lengths in another unit, and nodes too far apart; see `resolution`."""
+    width, given = resolution.boundary_width(case.model.kappa_eta, case.model.B), case.particles
+    if kept or width is None:
+        return
+    if given.source == "packing":
+        largest = given.mean_radius or max(radius for radius, _ in given.histogram)
+        named = "particles.mean_radius" if given.mean_radius else "particles.histogram"
+    else:
+        named, largest = "particles.sizes", 0.5 * max(chain.from_iterable(given.sizes), default=0.0)
+        if given.radii:
+            named, largest = "particles.radii", max(given.radii)
+    found = resolution.wrong_lengths(width, given.interface_width, (named, largest), case.nodes.spacing)
+    for key, allowed in found:
+        yield Problem(key, case.nodes.spacing if key == "nodes.spacing" else largest, allowed)
 
 
 def _points_of_their_own(case: Case) -> Iterator[Problem]:
@@ -868,9 +886,9 @@ def case_schema() -> dict[str, Any]:
     return Case.model_json_schema()
 
 
-def load_case(path: Path | str) -> Case:
-    """The case in a TOML or JSON file. Raises `CaseError`."""
-    return parse_case(read_tree(path), base=Path(path).parent)
+def load_case(path: Path | str, kept: bool = False) -> Case:
+    """The case in a TOML or JSON file; see `parse_case`. Raises `CaseError`."""
+    return parse_case(read_tree(path), Path(path).parent, kept)
 
 
 def read_tree(path: Path | str) -> Any:
@@ -888,12 +906,22 @@ def read_tree(path: Path | str) -> Any:
         raise CaseError([Problem(str(path), None, f"not valid {kind}: {error}")]) from error
 
 
-def parse_case(tree: Mapping[str, Any], base: Path | None = None) -> Case:
-    """The case in a tree of plain values; relative paths start from `base`. Raises `CaseError`."""
+def parse_case(tree: Mapping[str, Any], base: Path | None = None, kept: bool = False) -> Case:
+    """The case in a tree of plain values; relative paths start from `base`; kept: it was accepted before.
+
+    Raises `CaseError`.
+    """
+    _refuse(_not_a_case(tree))
     try:
-        return Case.model_validate(tree, context={"base": base})
+        return Case.model_validate(tree, context={"base": base, "kept": kept})
     except ValidationError as error:
         raise refusal(error, _table) from None
+
+
+def _not_a_case(tree: object) -> Iterator[Problem]:
+    """Of a sweep in the place of a case, one sentence instead of a line for each of its keys."""
+    if isinstance(tree, Mapping) and "base" in tree:
+        yield Problem("base", None, "this is a sweep, not a case: `frit sweep run` and `frit submit` take sweeps")
 
 
 def refusal(error: ValidationError, table_at: Callable[[Place], type[BaseModel]]) -> CaseError:

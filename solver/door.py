@@ -138,7 +138,7 @@ class Result:
     """What a run gives."""
 
     case: Case  # with every default, and the particles of a packing
-    ended: str  # "done", "stopped" by the observer, "interrupted" by Ctrl-C; "failed" in a SimulationError
+    ended: str  # "succeeded", "stopped" by the observer, "interrupted" by Ctrl-C; "failed" in a SimulationError
     rows: list[dict[str, Any]]  # of the history: `pandas.DataFrame(result.rows)`
     snapshots: Snapshots
     final: Moment  # the last state
@@ -176,7 +176,7 @@ def simulate(case: Given, observer: Observer | None = None, progress: bool | Non
                 ending = run(system, state, integrator, listener)
             except (RunError, FloatingPointError) as error:
                 raise SimulationError(str(error), listener.result(system, state, "failed")) from error
-    ended = "done" if ending is Ending.DONE else "interrupted" if listener.interrupted else "stopped"
+    ended = "succeeded" if ending is Ending.DONE else "interrupted" if listener.interrupted else "stopped"
     return listener.result(system, state, ended)
 
 

@@ -4,7 +4,6 @@ Lengths are in units of the mean radius and measured from the container's lower 
 """
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -39,13 +38,8 @@ HEAT = 0.04  # thermal velocity of shaking at its start, which makes overlaps of
 class Heap:
     """Particles with centres x (n, 3) and radii r (n,); in 2-D the third component is 0."""
 
-    def __init__(
-        self, r: Floats, box: Floats, rng: np.random.Generator, pause: Callable[[], None] = lambda: None
-    ) -> None:
-        """Cohesive settling: each particle stays where it first touches. The pile may be higher than the box (dim,).
-
-        pause is called between batches of at most 100 steps; what it raises ends the work.
-        """
+    def __init__(self, r: Floats, box: Floats, rng: np.random.Generator) -> None:
+        """Cohesive settling: each particle stays where it first touches. The pile may be higher than the box (dim,)."""
         n, self.dim = len(r), len(box)
         self.up = self.dim - 1
         self.r = r.copy()
@@ -54,7 +48,7 @@ class Heap:
         self.high[: self.dim] = box
         self.x, self.v, self.spin = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self.contacts = dem.no_contacts()
-        self.rng, self.pause = rng, pause
+        self.rng = rng
         level = float(volumes(self.r, self.dim).sum() / np.prod(box[:-1])) / LOOSEST[self.dim]
         dem.deposit(self.x, self.r, rng.random((n, TRIES, self.up)), self.low, self.high, self.dim, level)
         # Neighbours in space become neighbours in memory.
@@ -72,7 +66,6 @@ class Heap:
             "gravity": 0.0, "friction": 0.0, "cohesion": 0.0, "reach": 0.0, "damping": 0.3, "drag": 0.0,
             "squeeze": 0.0, "lid": True, "dt": DT,
         } | physics  # fmt: skip
-        self.pause()
         self.contacts, strain = dem.march(
             self.x, self.v, self.spin, self.r, self.low, self.high,
             dem.Physics(self.dim, **given), self.contacts, steps,

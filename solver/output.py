@@ -13,7 +13,7 @@ import numpy as np
 
 from .arrays import Floats, Numbers
 from .case import Case
-from .durable import replace_durably, write_whole
+from .durable import read_json, replace_durably, write_whole
 from .partition import Collector, Ranks
 
 BLOCK = 65_536  # nodes per chunk of a snapshot
@@ -44,6 +44,11 @@ def remove_torn(directory: Path) -> None:
     for name in OWN:
         for torn in directory.glob(f"{name}*.new"):
             torn.unlink(missing_ok=True)
+
+
+def read_state(directory: Path) -> str | None:
+    """Of run.json; None before there is one."""
+    return read_json(directory / "run.json").get("state")
 
 
 def now() -> str:

@@ -6,7 +6,6 @@ packed again. Replicates that share a packing, and runs that start anew, find it
 
 import hashlib
 import json
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,9 @@ NAME = "particles.csv"  # in a run directory
 CODE = ("dem.py", "heap.py", "jit.py", "overlaps.py", "packing.py", "pack_measures.py", "radii.py")
 
 
-def packed(case: Case, pause: Callable[[], None] = lambda: None) -> Packing:
-    """The packing that a case asks for, from the cache if it is there. Raises `CaseError` where there can be none.
-
-    pause: see `Request`.
-    """
-    wanted = request(case, pause)
+def packed(case: Case) -> Packing:
+    """The packing that a case asks for, from the cache if it is there. Raises `CaseError` where there can be none."""
+    wanted = request(case)
     path = cache_root() / "packings" / f"{key(wanted)}.json"
     packing = read(path)
     if packing is None:
@@ -70,9 +66,7 @@ def read(path: Path) -> Packing | None:
     return Packing(np.array(centres), np.array(radii), realised)
 
 
-def place(
-    case: Case, directory: Path, fresh: bool, pause: Callable[[], None]
-) -> tuple[Case, dict[str, Any] | None]:
+def place(case: Case, directory: Path, fresh: bool) -> tuple[Case, dict[str, Any] | None]:
     """The case with its particles, and what they are like where they were packed just now.
 
     A fresh run writes them into its directory, a resumed one reads them there. The asked case keeps its identity.
@@ -80,7 +74,7 @@ def place(
     if case.particles.source != "packing":
         return case, None
     if fresh:
-        packing = packed(case, pause)
+        packing = packed(case)
         particle_file.write(directory / NAME, packing.centres, packing.radii)
         return case.with_particles(packing.centres, packing.radii), packing.realised
     return case.with_particles(*particle_file.read(directory / NAME, case.dim)), None

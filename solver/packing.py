@@ -16,8 +16,7 @@ A trial depends on the request and its number alone; everything is serial, so a 
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,15 +37,11 @@ SAMPLE = 10_000  # particles from which the mean volume is known before they are
 
 @dataclass(frozen=True)
 class Request:
-    """What decides a packing: the table of the case, and the box in which a density is measured (None: all).
-
-    pause decides nothing: it is called again and again while particles are packed, and may raise to end that.
-    """
+    """What decides a packing: the table of the case, and the box in which a density is measured (None: all)."""
 
     particles: Particles
     container: Box
     box: Box | None
-    pause: Callable[[], None] = field(default=lambda: None, compare=False)
 
     @property
     def size(self) -> Floats:
@@ -83,7 +78,7 @@ class Packing:
     realised: dict[str, Any]
 
 
-def request(case: Case, pause: Callable[[], None] = lambda: None) -> Request:
+def request(case: Case) -> Request:
     """The packing that a case asks for. The vacancy box counts where it decides the packing and is in the container."""
     given = case.particles
     if given.source != "packing" or given.container is None:
@@ -93,7 +88,7 @@ def request(case: Case, pause: Callable[[], None] = lambda: None) -> Request:
     outside = (np.array(case.output.vacancy_box[0]) < low).any() or (np.array(case.output.vacancy_box[1]) > high).any()
     if given.method == "pour" or given.packing_density is None or outside:
         box = None
-    return Request(given, given.container, box, pause)
+    return Request(given, given.container, box)
 
 
 def make(wanted: Request) -> Packing:
@@ -129,7 +124,7 @@ def _start(wanted: Request, count: int, trial: int) -> tuple[Heap, float]:
     rng = np.random.default_rng([wanted.particles.seed or 0, trial])
     radii = wanted.radii(count, rng)
     unit = float(radii.mean())
-    return Heap(radii / unit, wanted.size / unit, rng, wanted.pause), unit
+    return Heap(radii / unit, wanted.size / unit, rng), unit
 
 
 def _finish(wanted: Request, heap: Heap, unit: float, trial: int) -> Packing | None:

@@ -234,6 +234,7 @@ def _types(schema: Mapping[str, Any], parts: list[str]) -> Iterator[str]:
 
 
 _SCHEMA = case_schema()
+CASE_TABLES = frozenset(_SCHEMA["properties"]) - {"name"}
 
 # --- reading
 
@@ -254,10 +255,27 @@ def parse_sweep(tree: Mapping[str, Any], base: Path | None = None) -> Sweep:
     Relative paths start from the folder `base`. Without one there is no file to be relative to: `base` in the tree
     must be a table then, never the path of a case.
     """
+    if wrong := [*_misplaced(tree)]:
+        raise CaseError(wrong)
     try:
         return Sweep.model_validate(_found(tree, base))
     except ValidationError as error:
         raise refusal(error, _part) from None
+
+
+def _misplaced(tree: object) -> Iterator[Problem]:
+    """A case in the place of a sweep, told in one sentence; keys of [sample] and of the case above all tables."""
+    if not isinstance(tree, Mapping):
+        return
+    if not {"base", "axes", "sample"} & tree.keys() and {"domain", "particles"} & tree.keys():
+        words = "this is a case, not a sweep: `frit run` and `frit submit` take cases; a sweep has a [base] and [axes]"
+        yield Problem("base", None, words)
+        return
+    for key in (key for key in tree if key not in Sweep.model_fields):
+        if key in Sample.model_fields:
+            yield Problem(str(key), tree[key], "put it in [sample]")
+        elif key in CASE_TABLES:
+            yield Problem(str(key), None, f"belongs to the case: put it in [base.{key}]")
 
 
 def _found(tree: object, base: Path | None) -> object:

@@ -2,22 +2,25 @@
 
 import json
 import re
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
+from rich.console import Group
+from rich.live import Live
 
 from frit.solver.characters import visible
 
-from .speaking import HERE, JobId, Secret, Url, row, speaking, tell, tell_rows
-from .terminal import AsJson, Recompute, SweepFile, refuse, show_table
+from .speaking import HERE, JobId, Secret, Url, find_job, jobs_of, row, speaking, sweeps_of, tell, tell_rows
+from .terminal import AsJson, Recompute, Shown, SweepFile, in_words, refuse, show_table, table_of
 
 if TYPE_CHECKING:
     from ..client import Client
-    from ..remote import RemoteJob
+    from ..remote import RemoteJob, RemoteSweep
 
-SWEEP = re.compile(r"s[0-9]+")
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 BYTES = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 ENDED = ("succeeded", "failed", "cancelled", "timed_out", "error", "lost")
@@ -44,19 +47,51 @@ def submit(
     with speaking(url, token, str(file)) as client:
         given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
         submitted = client.submit(file, recompute=recompute, reuse=not again, **given)
+        if not as_json:
+            typer.echo(submitted.id)
+            if (data := submitted.data).get("points") is not None:
+                counts = f"{data['points']} points, {data['reused']} reused, {data['new']} new"
+                more = f", {data['duplicates']} duplicates left out" if data["duplicates"] else ""
+                typer.echo(f"sweep {data['name']!r}: {counts}{more}", err=True)
+            elif not wait and submitted.data.get("state", "queued") != "queued":
+                state = submitted.data["state"]
+                typer.echo(f"this case is there already: {state}; --again computes it once more", err=True)
         if wait:
-            submitted.wait()
+            wait_for(submitted)
         found = [submitted] if isinstance(submitted, RemoteJob) else list(submitted.jobs())
         if as_json:
             typer.echo(json.dumps(submitted.data, indent=2))
-        else:
-            typer.echo(submitted.id)
-            if isinstance(submitted, RemoteJob) and not wait and submitted.state != "queued":
-                typer.echo(f"this case is there already: {submitted.state}; --again computes it once more", err=True)
-            if wait:
-                show_table([row(job) for job in found])
+        elif wait:
+            show_table([row(job) for job in found])
         if wait and any(job.state != "succeeded" for job in found):
             raise typer.Exit(1)
+
+
+def wait_for(submitted: "RemoteJob | RemoteSweep") -> None:
+    """To its end, with progress; Ctrl-C leaves it running."""
+    from ..remote import RemoteJob
+
+    try:
+        with Shown() as shown:
+            if isinstance(submitted, RemoteJob):
+                submitted.wait(tell=lambda job: tell_of(job, shown))
+            else:
+                submitted.wait(tell=lambda sweep: tell_of_all(sweep, shown))
+    except KeyboardInterrupt:
+        typer.echo(f"no longer waiting: {submitted.id} goes on; `frit jobs` shows it", err=True)
+        raise typer.Exit(130) from None
+
+
+def tell_of(job: "RemoteJob", shown: Shown) -> None:
+    """Where a job is."""
+    now = job.progress or {}
+    shown.tell(f"{job.state} {in_words(now) if now else ''}".rstrip(), now.get("time"), now.get("end"))
+
+
+def tell_of_all(sweep: "RemoteSweep", shown: Shown) -> None:
+    """Where the jobs of a sweep are."""
+    running = [job.progress for job in sweep.jobs(state="starting,running", limit=200)]
+    shown.tell_all(sweep.states, running, sum(n for state, n in sweep.states.items() if state in ENDED))
 
 
 def jobs(
@@ -67,7 +102,7 @@ def jobs(
     as_json: AsJson = False,
 ) -> None:
     """List jobs, newest first; filters as in HTTP: state=queued particles.mean_radius.ge=9 order=name sweep=s1."""
-    filters = dict(word.split("=", 1) for word in where or () if "=" in word)
+    filters = filters_of(word for word in where or () if "=" in word)
     if wrong := [word for word in where or () if "=" not in word]:
         refuse(f"{wrong[0]}: must be KEY=VALUE, as state=running")
     with speaking(url, token) as client:
@@ -79,13 +114,62 @@ def jobs(
         if as_json:
             typer.echo(json.dumps([job.data for job in found], indent=2))
         else:
-            show_table([row(job) for job in found])
+            shown = f"no job fits {' '.join(where)}" if where else "no jobs yet"
+            show_table([row(job) for job in found], shown)
+
+
+def top(
+    every: Annotated[float, typer.Option(metavar="SECONDS", min=0.2, help="Between two looks.")] = 2.0,
+    once: Annotated[bool, typer.Option("--once", help="Look once, and end.")] = False,
+    url: Url = HERE,
+    token: Secret = None,
+) -> None:
+    """Watch what runs: jobs, cores, speed, time left. Ctrl-C ends it."""
+    with speaking(url, token) as client:
+        if once or not sys.stdout.isatty():
+            typer.echo(summary_of(found := going(client), client))
+            show_table([busy_row(job) for job in found])
+            return
+        with Live(screen=True, auto_refresh=False) as live:
+            while True:
+                found = going(client)
+                live.update(Group(summary_of(found, client), table_of([busy_row(job) for job in found])), refresh=True)
+                time.sleep(every)
+
+
+def going(client: "Client") -> "list[RemoteJob]":
+    """What has not ended: what runs first."""
+    now = [*client.jobs(state="starting,running", limit=200)]
+    return [*now, *islice(client.jobs(state="queued", order="created", limit=20), 20)]
+
+
+def summary_of(found: "Sequence[RemoteJob]", client: "Client") -> str:
+    """Cores that are in use, jobs that run."""
+    running = [job for job in found if job.state != "queued"]
+    return f"{sum(job.data['ranks'] for job in running)} of {client.limits()['cores']} cores, {len(running)} jobs run"
+
+
+def busy_row(job: "RemoteJob") -> dict[str, Any]:
+    """Of the table of what runs."""
+    shown, speed = row(job), (job.progress or {}).get("evaluations_per_second")
+    return {
+        **{key: shown[key] for key in ("id", "state", "name", "ranks", "done", "left")},
+        "evaluations_per_second": speed, "vacancy_ratio": (job.progress or {}).get("vacancy_ratio"),
+    }  # fmt: skip
+
+
+def filters_of(words: Iterable[str]) -> dict[str, Any]:
+    """Of KEY=VALUE; several values of `state` mean any of them."""
+    filters = dict[str, Any]()
+    for key, value in (word.split("=", 1) for word in words):
+        filters[key] = f"{filters[key]},{value}" if key == "state" and key in filters else value
+    return filters
 
 
 def show(identifier: JobId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
     """Show all about one job."""
     with speaking(url, token) as client:
-        data = client.job(identifier).data
+        data = find_job(client, identifier).data
     if as_json:
         typer.echo(json.dumps(data, indent=2))
         return
@@ -103,7 +187,7 @@ def log(
 ) -> None:
     """Print the log of one job."""
     with speaking(url, token) as client:
-        job, offset = client.job(identifier), 0
+        job, offset = find_job(client, identifier), 0
         while True:
             final = job.final  # as it was before the last look
             added = job.log_bytes(offset)
@@ -159,9 +243,14 @@ def remove(
 
 def removed(client: "Client", identifier: str) -> dict[str, Any]:
     """Of one job or sweep: whether it is gone, and why not."""
-    thing = "sweeps" if SWEEP.fullmatch(identifier) else "jobs"
+    found: Sequence[RemoteJob | RemoteSweep] = jobs_of(client, identifier) or sweeps_of(client, identifier)
+    if not found:
+        return {"id": identifier, "removed": False, "reason": "there is none"}
+    if len(found) > 1:
+        reason = f"several have this name: give an id, as {' or '.join(each.id for each in found[:2])}"
+        return {"id": identifier, "removed": False, "reason": reason}
     try:
-        client.delete(f"/v1/{thing}/{identifier}")
+        found[0].delete()
     except client.Problem as error:
         if error.status not in (404, 409):
             raise
@@ -255,6 +344,6 @@ def alter(
 ) -> None:
     """Have something done to a job, and tell its state."""
     with speaking(url, token) as client:
-        job = move(client.job(identifier))
+        job = move(find_job(client, identifier))
         word = "stopping" if job.data.get("stopping") else job.state
         tell(job.data, as_json, f"{job.id} {word}")

@@ -8,8 +8,7 @@ import json
 import math
 import os
 import signal
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,13 +17,13 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from frit.solver.ended import SUCCEEDED, read_run
 
+from ..jobs.child import die_with
 from ..jobs.launch import Launch, LaunchError, Outcome
 from . import compare, index, jobs, pictures, serve, service, sweep, token
-from .terminal import AsJson, cell, in_words, refuse
+from .terminal import AsJson, Shown, cell, in_words, refuse
 
 EXIT = {SUCCEEDED: 0, "failed": 1, "refused": 2, "interrupted": 130}
 GRACE = 300.0  # seconds for the checkpoint after Ctrl-C or TERM; a second Ctrl-C does not wait
@@ -33,14 +32,9 @@ app = typer.Typer(
     name="frit",
     help="Meshfree phase-field sintering of metal particles.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
-app.add_typer(index.db, name="db")
-app.command()(index.reindex)
-app.add_typer(sweep.app, name="sweep")
-app.add_typer(token.app, name="token")
-app.add_typer(service.files, name="files")
 
 
 def at_least_one(ranks: int | None) -> int | None:
@@ -60,6 +54,12 @@ def main() -> None:
     app()
 
 
+def group(panel: str, *commands: tuple[str, Callable[..., Any], str]) -> None:
+    """Commands under one heading of the help, each with an example."""
+    for name, function, example in commands:
+        app.command(name, rich_help_panel=panel, epilog=f"Example: {example}")(function)
+
+
 def show_version(wanted: bool) -> None:
     """Option callback."""
     if wanted:
@@ -77,7 +77,6 @@ def frit(
     """Options before the command."""
 
 
-@app.command()
 def run(
     case: CaseFile,
     ranks: Ranks = 1,
@@ -98,7 +97,6 @@ def run(
     follow(ranks, [str(case), "--out", str(directory), "--progress"], directory, as_json, profile)
 
 
-@app.command()
 def resume(
     directory: RunDirectory,
     ranks: Annotated[
@@ -120,14 +118,6 @@ def resume(
     follow(ranks, ["--resume", str(directory), "--progress"], directory, as_json)
 
 
-for command in (pictures.plot, pictures.movie,
-                serve.serve, jobs.submit, jobs.jobs, jobs.show, jobs.log, jobs.cancel, jobs.retry, jobs.rerun,
-                jobs.change, jobs.gc, compare.compare, service.plan, service.limits, service.events):  # fmt: skip
-    app.command()(command)
-app.command("rm")(jobs.remove)
-
-
-@app.command("pack")
 def pack_only(
     case: CaseFile,
     out: Annotated[Path, typer.Option(metavar="FILE.csv", dir_okay=False, help="Particles: x,y[,z],radius, nm.")],
@@ -155,7 +145,6 @@ def pack_only(
     typer.echo(f"{out}, {picture}")
 
 
-@app.command()
 def schema() -> None:
     """JSON Schema of the case file."""
     from frit.solver.case import case_schema
@@ -173,21 +162,64 @@ def check_case(path: Path) -> None:
         refuse(*(f"{path}: {line}" for line in str(error).splitlines()))
 
 
+# --- the commands, those most used first -------------------------------------------------------------
+
+group(
+    "Run a case here",
+    ("run", run, "frit run case.toml --ranks 2"),
+    ("resume", resume, "frit resume runs/case"),
+    ("plot", pictures.plot, "frit plot runs/case --time 5"),
+    ("movie", pictures.movie, "frit movie runs/case"),
+    ("pack", pack_only, "frit pack case.toml --out particles.csv"),
+    ("schema", schema, "frit schema > case.schema.json"),
+)
+app.add_typer(sweep.app, name="sweep", rich_help_panel=(SWEEPS := "Sweeps"))
+group(SWEEPS, ("compare", compare.compare, 'frit compare "density by spread" --data data --out curves.png'))
+group(
+    "The service",
+    ("serve", serve.serve, "frit serve --data data --cores 8"),
+    ("submit", jobs.submit, "frit submit density.toml --wait"),
+    ("jobs", jobs.jobs, "frit jobs state=running particles.mean_radius.ge=9"),
+    ("top", jobs.top, "frit top"),
+    ("show", jobs.show, "frit show 3fa9"),
+    ("log", jobs.log, "frit log 3fa9 -f"),
+    ("cancel", jobs.cancel, "frit cancel 3fa9"),
+    ("retry", jobs.retry, "frit retry 3fa9"),
+    ("rerun", jobs.rerun, "frit rerun 3fa9"),
+    ("change", jobs.change, "frit change 3fa9 --priority 5 --tag urgent"),
+    ("plan", service.plan, "frit plan density.toml"),
+    ("limits", service.limits, "frit limits"),
+    ("events", service.events, "frit events --since 0"),
+)
+app.add_typer(token.app, name="token", rich_help_panel="The service")
+group(
+    DATA := "Data",
+    ("rm", jobs.remove, "frit rm 3fa9 s2"),
+    ("gc", jobs.gc, "frit gc --keep 30d --keep succeeded"),
+    ("reindex", index.reindex, "frit reindex --data data"),
+)
+app.add_typer(service.files, name="files", rich_help_panel=DATA)
+app.add_typer(index.db, name="db", rich_help_panel=DATA)
+
+
 # --- following a launch ---------------------------------------------------------------------------------
 
 
 def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, profile: bool = False) -> NoReturn:
     """Launch the solver, show its progress to the end, and leave with the exit status of its outcome."""
+    if ranks > (cores := len(os.sched_getaffinity(0))):
+        typer.echo(f"--ranks {ranks}: there are {cores} cores; ranks that share one wait for each other", err=True)
     try:
-        launch = Launch(ranks, arguments, directory)
+        tied = die_with(os.getpid(), signal.SIGTERM)  # killed without a word, it leaves a checkpoint all the same
+        launch = Launch(ranks, arguments, directory, first=tied)
     except (LaunchError, OSError) as error:
         refuse(str(error))
     start, progress = monotonic(), dict[str, Any]()
-    with launch, progress_bar() as (bar, task), signals_passed_on(launch, bar, task):
-        for progress in launch:
-            bar.update(task, completed=progress.get("time"), total=progress.get("end"))
+    with launch, Shown() as shown, signals_passed_on(launch, shown):
+        for line in launch:
             if not launch.stopping:
-                bar.update(task, description=in_words(progress))
+                shown.tell(in_words(line), line.get("time"), line.get("end"))
+            progress = line if "time" in line else progress
         outcome = launch.wait()
     report(directory, outcome, progress, monotonic() - start, as_json)
     if profile and (seconds := read_run(directory).get("profile")):
@@ -198,14 +230,15 @@ def follow(ranks: int, arguments: list[str], directory: Path, as_json: bool, pro
 
 
 @contextmanager
-def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[None]:
+def signals_passed_on(launch: Launch, shown: Shown) -> Iterator[None]:
     """INT, TERM, HUP: one TERM to the ranks; a second INT kills. What nohup or & had ignored stays so."""
 
     def handle(number: int, _: object) -> None:
         if launch.stopping and number == signal.SIGINT:
             launch.kill()
         launch.stop(GRACE)
-        bar.update(task, description="writing a checkpoint; Ctrl-C again kills")
+        keeps = "writing a checkpoint" if launch.marches else "stopping"
+        shown.tell(f"{keeps}; Ctrl-C again kills")
 
     before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
@@ -216,15 +249,6 @@ def signals_passed_on(launch: Launch, bar: Progress, task: TaskID) -> Iterator[N
     finally:
         for number in heard:
             signal.signal(number, before[number])
-
-
-@contextmanager
-def progress_bar() -> Iterator[tuple[Progress, TaskID]]:
-    """On stderr, and only where somebody sees it."""
-    seen = sys.stdout.isatty() and sys.stderr.isatty()
-    text = TextColumn("{task.description}", markup=False)
-    with Progress(BarColumn(bar_width=12), text, console=Console(stderr=True), disable=not seen) as bar:
-        yield bar, bar.add_task("starting", total=None)
 
 
 def report(

@@ -3,24 +3,20 @@
 import asyncio
 import json
 import signal
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
 
 from frit.solver.characters import visible
 
-from .speaking import HERE, Secret, SweepId, Url, row, speaking, tell, tell_rows
-from .terminal import AsJson, DataFolder, Recompute, SweepFile, in_words, of_older, refuse, show_table
+from .speaking import HERE, Secret, SweepId, Url, find_sweep, row, speaking, tell, tell_rows
+from .terminal import AsJson, DataFolder, Recompute, Shown, SweepFile, must_be_there, of_older, refuse, show_table
 
 app = typer.Typer(no_args_is_help=True, help="Sweeps: their cost, running them without a server, those of a service.")
-
-WIDEST = 44  # characters of a name in a table
 
 
 @app.command()
@@ -34,6 +30,7 @@ def plan(
     from ..index.store import Store
 
     expansion = expanded(file)[1]
+    must_be_there(data)
     past, done, older = list[Measured](), set[str](), dict[str, int]()
     if (data / "frit.db").exists():
         store = Store(data, writable=False)
@@ -88,20 +85,21 @@ def list_sweeps(url: Url = HERE, token: Secret = None, as_json: AsJson = False) 
     """List the sweeps of a service, newest first."""
     with speaking(url, token) as client:
         rows = [sweep.data for sweep in client.sweeps()]
-    shown = [{key: str(value) if key == "states" else value for key, value in row.items()} for row in rows]
-    tell_rows(rows, as_json, [{key: row[key] for key in ("id", "name", "points", "states")} for row in shown])
+    keys = ("id", "name", "points", "reused", "new")
+    shown = [{**{key: row[key] for key in keys}, "states": in_states(row["states"])} for row in rows]
+    tell_rows(rows, as_json, shown, "no sweeps yet")
 
 
 @app.command()
 def show(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
     """Show a sweep of a service and its jobs."""
     with speaking(url, token) as client:
-        found = client.sweep(sweep)
+        found = find_sweep(client, sweep)
         rows = [job.data if as_json else row(job) for job in found.jobs()]
     if as_json:
         typer.echo(json.dumps({**found.data, "jobs": rows}, indent=2))
         return
-    typer.echo(f"{found.id} {visible(found.name)}: {found.states}")
+    typer.echo(f"{found.id} {visible(found.name)}: {in_states(found.states)}")
     show_table(rows)
 
 
@@ -109,16 +107,21 @@ def show(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson 
 def cancel(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
     """End all jobs of a sweep of a service."""
     with speaking(url, token) as client:
-        found = client.sweep(sweep).cancel()
-    tell(found.data, as_json, f"{found.id} {found.states}")
+        found = find_sweep(client, sweep).cancel()
+    tell(found.data, as_json, f"{found.id} {in_states(found.states)}")
 
 
 @app.command()
 def retry(sweep: SweepId, url: Url = HERE, token: Secret = None, as_json: AsJson = False) -> None:
     """Queue all jobs of a sweep of a service that did not succeed again."""
     with speaking(url, token) as client:
-        found = client.sweep(sweep).retry()
-    tell(found.data, as_json, f"{found.id} {found.states}")
+        found = find_sweep(client, sweep).retry()
+    tell(found.data, as_json, f"{found.id} {in_states(found.states)}")
+
+
+def in_states(states: Mapping[str, int]) -> str:
+    """How many jobs are in which state, in words."""
+    return ", ".join(f"{n} {state}" for state, n in states.items())
 
 
 def expanded(file: Path) -> tuple[Any, Any]:
@@ -149,19 +152,20 @@ async def run_here(
 
 
 async def follow(engine: Any, sweep: str) -> bool:
-    """Show one line per running job until all are final; True where Ctrl-C came before."""
+    """Show one line for all jobs until they are final; True where Ctrl-C came before."""
     stop = asyncio.Event()
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live, stopping(stop):
+    with Shown() as shown, stopping(stop):
         while True:
             seen = engine.notifier.count
             points = engine.store.sweep_points(sweep)
-            if live.console.is_terminal:
-                live.update(lines(points, engine.progress, stop.is_set()), refresh=True)
+            states = Counter(point.job.state.value for point in points)
+            running = [engine.progress(point.job.id) for point in points if point.job.state.active]
+            shown.tell_all(states, running, sum(point.job.final for point in points))
             if all(point.job.final for point in points):
                 return False
             if stop.is_set():
-                releasing = asyncio.create_task(engine.scheduler.release())
-                await releasing
+                shown.tell("writing checkpoints")
+                await engine.scheduler.release()
                 return True
             await engine.notifier.wait(1.0, seen)
 
@@ -178,18 +182,6 @@ def stopping(stop: asyncio.Event) -> Iterator[None]:
     finally:
         for number in heard:
             loop.remove_signal_handler(number)
-
-
-def lines(points: Any, progress: Any, stopping: bool) -> Table:
-    """How many are done, and where each running job is."""
-    table = Table.grid(padding=(0, 1))
-    done = sum(point.job.final for point in points)
-    table.add_row(f"{done} of {len(points)} done", "writing checkpoints" if stopping else "")
-    for point in points:
-        if point.job.state.active:
-            now = progress(point.job.id)
-            table.add_row(point.name[:WIDEST], in_words(now) if now else point.job.state.value)
-    return table
 
 
 def rows_of(store: Any, sweep: str) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .terminal import AsJson, DataFolder, refuse
+from .terminal import AsJson, DataFolder, must_be_there, refuse
 
 app = typer.Typer(name="token", help="Access tokens of a data folder; they count at once.", no_args_is_help=True)
 
@@ -39,6 +39,7 @@ def revoke(
     from ..index import tokens
     from ..index.records import NotFoundError, StoreError
 
+    must_be_there(data)
     try:
         tokens.revoke(data, name)
     except (NotFoundError, StoreError) as error:
@@ -53,6 +54,7 @@ def show(data: DataFolder = Path("data"), as_json: AsJson = False) -> None:
     from ..index import tokens
     from ..index.records import StoreError
 
+    must_be_there(data)
     try:
         found = tokens.listed(data)
     except StoreError as error:

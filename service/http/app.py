@@ -9,7 +9,7 @@ from fastapi import Depends, FastAPI
 
 from ..jobs.engine import Engine
 from ..settings import Settings
-from . import files, jobs, metrics, openapi, service, sweeps
+from . import documents, files, jobs, metrics, openapi, service, sweeps
 from .asking import Rooms
 from .bodies import AT_ONCE
 from .problems import handle_problems
@@ -34,7 +34,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     app = FastAPI(
         title="frit", version=openapi.version(), description=openapi.DESCRIPTION, lifespan=lifespan,
-        generate_unique_id_function=lambda route: route.name,
+        generate_unique_id_function=lambda route: route.name, docs_url=None, redoc_url=None,
     )  # fmt: skip
     handle_problems(app, [route for router in ROUTERS for route in router.routes])
     for router in ROUTERS:
@@ -48,4 +48,5 @@ def create_app(settings: Settings) -> FastAPI:
     metrics.expose(app, engine, dependencies=[Depends(needs("read"))], tags=["service"], responses=refusals)
     app.add_middleware(Gate, settings=settings, store=lambda: engine().store)
     openapi.complete(app, settings.cores)
+    documents.expose(app)
     return app

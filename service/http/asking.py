@@ -49,7 +49,7 @@ class Rooms:
     def _tidy_once(self) -> None:
         """Nothing while there are more run directories than jobs: a lost index does not know what they use."""
         with os.scandir(self.engine.settings.runs) as folders:
-            runs = sum(1 for _ in folders)
+            runs = sum(folder.is_dir() for folder in folders)
         if runs <= sum(self.engine.store.counts().values()):
             self.shelf.tidy(self.engine.store.files_used())
 

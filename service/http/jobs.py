@@ -90,7 +90,7 @@ async def list_jobs(request: Request, response: Response, engine: TheEngine, who
         selection = filters.select(request.query_params.multi_items(), seq_of, who.only)
         value = None if selection.scalar is None else selection.scalar.sql
         found = store.page(selection.where, selection.order, selection.limit + 1, value, selection.few, selection.near)
-        listed = [shown.summary(job, hidden(engine)) for job, _ in found[: selection.limit]]
+        listed = [shown.summary(job, hidden(engine), engine.progress(job.id)) for job, _ in found[: selection.limit]]
         following = None
         if len(found) > selection.limit:
             cursor = filters.cursor(selection, *found[selection.limit - 1])

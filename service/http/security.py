@@ -31,7 +31,7 @@ AGAIN = "frit.again"  # of a request's scope: asks anew whether it is let in
 READING = ("GET", "HEAD", "OPTIONS")
 FILES = "/v1/files"  # takes files as they are
 OPEN = ("/livez", "/readyz")  # they tell nothing: health checks need neither token nor name
-DOCUMENTS = ("/docs", "/openapi.json", "/redoc")  # the same for every service of this version: no token
+DOCUMENTS = ("/", "/docs", "/openapi.json")  # the same for every service of this version: no token
 
 
 class AddressError(ValueError):

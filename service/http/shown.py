@@ -37,9 +37,9 @@ def links(identifier: str) -> dict[str, str]:
     return {"self": this, **parts, "zarr": f"{this}/snapshots.zarr"}
 
 
-def summary(job: Job, hidden: str, case: Mapping[str, Any] | None = None) -> JobSummary:
+def summary(job: Job, hidden: str, progress: dict[str, Any] | None) -> JobSummary:
     """A job without its case. `hidden`: the path of the data folder, which no message shows."""
-    return JobSummary(**_summary(job, hidden, json.loads(job.case) if case is None else case))
+    return JobSummary(**_summary(job, hidden, json.loads(job.case)), progress=progress)
 
 
 def _summary(job: Job, hidden: str, case: Mapping[str, Any]) -> dict[str, Any]:

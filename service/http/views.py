@@ -168,7 +168,10 @@ class AttemptView(BaseModel):
 
 
 class JobSummary(BaseModel):
-    """A job. `parameters`: every scalar of its case by dotted key; `result`: scalars of its last history row."""
+    """A job. `parameters`: every scalar of its case by dotted key; `result`: scalars of its last history row.
+
+    `progress`: while it runs, the last that its solver said.
+    """
 
     id: str
     name: str
@@ -193,14 +196,14 @@ class JobSummary(BaseModel):
     parameters: dict[str, Any]
     result: dict[str, Any]
     links: dict[str, str]
+    progress: dict[str, Any] | None
 
 
 class JobView(JobSummary):
-    """A job with its resolved case, its attempts and, while it runs, its last line of progress."""
+    """A job with its resolved case and its attempts."""
 
     case: dict[str, Any]
     attempts: list[AttemptView]
-    progress: dict[str, Any] | None
 
 
 class JobPage(BaseModel):

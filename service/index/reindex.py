@@ -175,7 +175,7 @@ class Book:
         known = {row["id"] for row in self.jobs.values()}
         lost = {row["id"] for row in self.gone.values()} - known
         found = []
-        for directory in sorted(runs.iterdir()) if runs.exists() else []:
+        for directory in sorted(path for path in runs.glob("*") if path.is_dir()):
             if directory.name in lost:  # a crash came before all of it was deleted
                 shutil.rmtree(directory, ignore_errors=True)
             elif directory.name not in known:
@@ -273,7 +273,7 @@ def job_of(directory: Path) -> Row:
     record = json.loads((directory / "job.json").read_text())
     case = (directory / "submitted.json").read_text()
     keys = ("name", "ranks", "priority", "tags", "time_limit", "created")
-    identity = record.get("identity") or parse_case(json.loads(case)).identity()
+    identity = record.get("identity") or parse_case(json.loads(case), kept=True).identity()
     row = {"seq": record.get("seq"), "id": directory.name, "identity": identity, "case": case}
     row |= {key: record.get(key) for key in ("owner", "origin")}
     return row | {key: record[key] for key in keys}

@@ -71,7 +71,7 @@ class Reader:
         if count <= self.place.snapshots:
             return []
         if self._times is None:
-            case: Case = parse_case(json.loads(self._case))
+            case: Case = parse_case(json.loads(self._case), kept=True)
             self._times = case.output.snapshot_times(case.time.end)
         first, self.place.snapshots = self.place.snapshots, count
         return list(enumerate(self._times))[first:count]

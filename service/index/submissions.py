@@ -29,6 +29,8 @@ from .records import (
 from .schema import events, idempotency, jobs, sweep_jobs, sweeps
 from .writer import Share, Transaction, Writer
 
+MOST_TAGS = 50  # of a job
+
 
 @dataclass(frozen=True)
 class _Submission:
@@ -226,6 +228,8 @@ def _jobs_of_points(
     urgent = max((job.priority for job in asked.values()), default=0)
     modest = waiting & ((jobs.c.priority < urgent) | jobs.c.time_limit.is_not(None))
     small = (jobs.c.state == State.FAILED) & (jobs.c.ranks < max((job.ranks for job in asked.values()), default=1))
+    if any(job.tags for job in asked.values()):
+        _tag(t, old, asked)
     for k in range(0, len(old), 500):
         query = sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]), undone | modest | small)
         for row in t.run(query).all():
@@ -243,6 +247,15 @@ def _jobs_of_points(
             missing.setdefault(point.job.identity, point.job)
     new = _insert(t, list(missing.values()))
     return numbers | {job.identity: job.seq for job in new}
+
+
+def _tag(t: Transaction, old: Sequence[int], asked: dict[str, NewJob]) -> None:
+    """Give shared jobs the tags that are asked for now, too: they are looked for by them."""
+    for k in range(0, len(old), 500):
+        for row in t.run(sa.select(jobs).where(jobs.c.seq.in_(old[k : k + 500]))).all():
+            tags = list(dict.fromkeys([*row.tags, *asked[row.identity].tags]))
+            if len(row.tags) < len(tags) <= MOST_TAGS:
+                set_columns(t, record(row), tags=tags)
 
 
 def _more(job: Any, asked: NewJob) -> dict[str, Any]:

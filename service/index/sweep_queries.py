@@ -40,6 +40,15 @@ class SweepQueries(Reading):
                 SweepPoint(row.position, row.label, row.parameters, record(row)) for row in connection.execute(query)
             ]
 
+    def listing(self) -> list[tuple[str, str, str, str]]:
+        """Of every job: id, name, names of its sweeps, state; the oldest first."""
+        query = (
+            "SELECT jobs.id, jobs.name, ifnull(group_concat(DISTINCT sweeps.name), ''), jobs.state FROM jobs "
+            "LEFT JOIN sweep_jobs ON sweep_jobs.job = jobs.seq LEFT JOIN sweeps ON sweeps.seq = sweep_jobs.sweep "
+            "GROUP BY jobs.seq ORDER BY jobs.seq"
+        )
+        return [(row[0], row[1], row[2], row[3]) for row in self._ask(query, ())]
+
     def new_in_sweeps(self, which: Sequence[int]) -> dict[int, int]:
         """How many jobs of each sweep (by seq) were made with it."""
         query = (

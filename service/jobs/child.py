@@ -4,6 +4,7 @@
 runner does nothing else.
 """
 
+import ctypes
 import os
 import select
 import signal
@@ -13,6 +14,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NoReturn
 
+PR_SET_PDEATHSIG = 1
+prctl = ctypes.CDLL(None).prctl
 UNHEARD = 127  # exit status where the program cannot be executed
 
 
@@ -97,3 +100,14 @@ def become(
         os.write(2, f"{command[0]}: {error.strerror}\n".encode())
     finally:
         os._exit(UNHEARD)
+
+
+def die_with(parent: int, number: signal.Signals) -> Callable[[], None]:
+    """For the child after the fork: get this signal when the parent is killed."""
+
+    def tie() -> None:
+        prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
+        if os.getppid() != parent:  # it died before the line above
+            os._exit(1)
+
+    return tie

@@ -4,12 +4,14 @@ import asyncio
 import errno
 import os
 import shutil
+import time
 from collections.abc import Sequence
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from frit.solver.durable import make_private
+from frit.solver.characters import visible
+from frit.solver.durable import make_private, write_whole
 
 from ..index.changes import May
 from ..index.migrations import IndexVersionError
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
     from frit.sweeps.expand import Expansion
 
 
+SELDOM = 20.0  # times as long as it takes pass between two lists of runs
+LONGEST = 60.0  # seconds between two looks whether the list of runs has changed
+
+
 class EngineError(RuntimeError):
     """The data folder cannot be used; the message says why."""
 
@@ -47,6 +53,7 @@ class Engine:
         self._backend = backend
         self._settling = set[asyncio.Task[None]]()
         self._stack = AsyncExitStack()
+        self._listed = ""  # what the list of runs said last
 
     async def __aenter__(self) -> Self:
         """Raises `EngineError`."""
@@ -66,10 +73,29 @@ class Engine:
             stack.push_async_callback(self.scheduler.close)
             await self._settle(await asyncio.to_thread(self.store.unsettled))
             await self.scheduler.adopt()
-            loop = asyncio.create_task(self.scheduler.run())
-            stack.callback(loop.cancel)
+            loops = [asyncio.create_task(work) for work in (self.scheduler.run(), self._tell())]
+            stack.callback(self._list)
+            for loop in loops:
+                stack.callback(loop.cancel)
             self._stack = stack.pop_all()
         return self
+
+    async def _tell(self) -> None:
+        """Keep the list of runs up to date; where there are many, not at every change."""
+        while True:
+            seen, began = self.notifier.count, time.monotonic()
+            await asyncio.to_thread(self._list)
+            await asyncio.sleep(SELDOM * (time.monotonic() - began) + 1.0)
+            await self.notifier.wait(LONGEST, seen)
+
+    def _list(self) -> None:
+        """`runs/INDEX.tsv` tells a person which folder is what; nobody else reads it."""
+        with suppress(OSError, StoreError):
+            rows = [("id", "name", "sweep", "state"), *self.store.listing()]
+            text = "".join("\t".join(visible(field) for field in row) + "\n" for row in rows)
+            if text != self._listed:
+                write_whole(self.settings.runs / "INDEX.tsv", text.encode(), durable=False)
+                self._listed = text
 
     async def _ended(self) -> None:
         """Removals under way come to their end."""

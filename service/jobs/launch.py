@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from frit.solver.durable import stamp
+from frit.solver.durable import stamp, write_json
 from frit.solver.ended import ENDS, read_run
 
 from .child import Child
@@ -116,6 +116,7 @@ class Launch:
         self._mark = f"FRIT_LAUNCH={environment['FRIT_LAUNCH']}"
         self.directory, self.stopping, self._adopts = directory, False, adopts
         self.marches = False  # whether the ranks have said that they step: only then can there be a new checkpoint
+        self.compiled = 0.0  # seconds that went into compiling, which is done once on a machine
         self._spoken: deque[str] = deque(maxlen=40)
         self._last_resort: threading.Timer | None = None
         directory.mkdir(parents=True, exist_ok=True)
@@ -130,6 +131,7 @@ class Launch:
             self.kill()
             self._process.wait()
             self._sweep_up()
+            self._settle("interrupted", "killed")
         if self._last_resort is not None:
             self._last_resort.cancel()
         self._process.close()
@@ -141,7 +143,8 @@ class Launch:
             with suppress(json.JSONDecodeError):
                 progress = json.loads(line)
             if isinstance(progress, dict):
-                self.marches = True
+                self.marches |= "time" in progress
+                self.compiled = progress.get("compiled", self.compiled)
                 yield progress
             elif line.strip():
                 self._spoken.append(line.rstrip())
@@ -171,6 +174,18 @@ class Launch:
 
     def wait(self) -> Outcome:
         """What run.json says, if it was written since the start, once the whole tree is gone."""
+        outcome = self._outcome()
+        self._settle(outcome.state, outcome.message)
+        return outcome
+
+    def _settle(self, state: str, message: str | None) -> None:
+        """run.json of a run that was killed: it does not stay `running`."""
+        record = read_run(self.directory)
+        if record.get("state") == "running" and stamp(self.directory / "run.json") != self._record_before:
+            with suppress(OSError):
+                write_json(self.directory / "run.json", record | {"state": state, "message": message})
+
+    def _outcome(self) -> Outcome:
         for _ in self:
             pass
         record, code, spoken = read_run(self.directory), self._process.wait(), "\n".join(self._spoken)
@@ -180,7 +195,7 @@ class Launch:
         if self.stopping and (self.directory / "checkpoint.h5").exists():
             return Outcome("interrupted", "no new checkpoint was written; the last one stands", code, spoken)
         if self.stopping:
-            return Outcome("failed", "stopped before the first checkpoint was written", code, spoken, retry=True)
+            return Outcome("interrupted", "stopped before the first checkpoint was written", code, "", retry=True)
         if code == 2:  # another's directory: the solver said so on stderr and left run.json alone
             return Outcome("refused", None, code, spoken, retry=True)
         message = f"mpirun ended with status {code} and no word of the solver"

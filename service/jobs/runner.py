@@ -14,7 +14,6 @@ Runners are forked from a process that has all of Python that they need (`fork_s
 and the service itself never forks.
 """
 
-import ctypes
 import gc
 import json
 import os
@@ -33,6 +32,7 @@ from typing import Any, NoReturn
 from frit.solver.durable import read_json, stamp, write_json
 from frit.solver.ended import SUCCEEDED, read_run
 
+from .child import die_with, prctl
 from .launch import Launch, LaunchError, Outcome, find_mpirun, is_open_mpi, kill_marked
 from .memory import memory_below
 from .processes import boot, is_at, remove_torn, start_of, try_lock
@@ -44,8 +44,7 @@ LOOK_EVERY = 1.0  # seconds between two looks at the folder, and at the memory t
 NOTHING_TO_KEEP = 5.0  # seconds from a wish to stop to KILL where no rank steps yet, and so no checkpoint can come
 STUBBORN = 60.0  # seconds for which a record that cannot be written (a full disk) is tried again
 LOCK = "runner.lock"
-PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
-prctl = ctypes.CDLL(None).prctl
+PR_SET_CHILD_SUBREAPER = 36
 STOPS = {"cancelled": Move.STOP, "timed_out": Move.TIME_OUT, "released": Move.RELEASE}
 
 
@@ -139,7 +138,9 @@ class Runner:
         except Exception as error:
             log(traceback.format_exc())
             move, message = Move.BREAK, f"runner: {type(error).__name__}: {error}"
-        seconds, further = (time.monotonic() - self.began) * order.ranks, advanced(self.directory, order.attempt)
+        compiled = 0.0 if self.launch is None else self.launch.compiled
+        seconds = max(0.0, time.monotonic() - self.began - compiled) * order.ranks
+        further = advanced(self.directory, order.attempt)
         end = Exit(order.attempt, move, message and one_sentence(message), time.time(), seconds, further)
         self.write("exit.json", asdict(end))
 
@@ -156,7 +157,8 @@ class Runner:
         os.sched_setaffinity(0, self.order.cores)
         try:
             launch = Launch(
-                self.order.ranks, self.arguments(), self.directory, self.marks(), die_with(os.getpid()), self.adopts
+                self.order.ranks, self.arguments(), self.directory, self.marks(), die_with(os.getpid(), signal.SIGKILL),
+                self.adopts,
             )
         except (LaunchError, OSError) as error:
             return Move.BREAK, str(error)
@@ -260,7 +262,7 @@ class Runner:
     def show(self, progress: dict[str, Any]) -> None:
         """Keep the solver's last progress line where the service finds it."""
         clock = time.monotonic()
-        if clock - self.shown >= PROGRESS_EVERY:
+        if clock - self.shown >= PROGRESS_EVERY or "phase" in progress:
             self.shown = clock
             with suppress(OSError):  # a full disk does not end a run that can go on
                 write_json(self.directory / "progress.json", progress, durable=False)
@@ -341,16 +343,6 @@ def timer(seconds: float, call: Callable[[], None]) -> None:
     waiting = threading.Timer(seconds, call)
     waiting.daemon = True
     waiting.start()
-
-
-def die_with(parent: int) -> Callable[[], None]:
-    """For the child after the fork: be killed when the parent is."""
-    def tie() -> None:
-        prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:  # it died before the line above
-            os._exit(1)
-
-    return tie
 
 
 if __name__ == "__main__":

@@ -287,6 +287,31 @@ def test_all_that_one_stage_can_find_is_reported_at_once() -> None:
     ]
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("m", 1e-9), ("mm", 1e-6), ("um", 1e-3)])
+def test_lengths_in_another_unit_are_told_by_the_width_of_a_boundary(unit: str, factor: float) -> None:
+    scaled = {
+        "domain.size": [100 * factor, 60 * factor],
+        "nodes.spacing": factor,
+        "particles": {"centres": [[30 * factor, 30 * factor]], "radii": [20 * factor]},
+    }
+    [line] = lines(altered(scaled))
+    assert line.startswith(f"particles.radii = {20 * factor}: must be at least 0.1155, a tenth of the width")
+    assert line.endswith(f"lengths are in nm (20 nm, if {unit} was meant)")
+
+
+def test_a_spacing_that_cannot_hold_an_interface_is_refused_but_for_what_was_accepted_before() -> None:
+    [line] = lines(altered({"nodes.spacing": 2.5}))
+    assert line.startswith("nodes.spacing = 2.5: cannot hold an interface: must be at most 2.309")
+    assert parse_case(altered({"nodes.spacing": 2.5}), kept=True).nodes.spacing == 2.5
+    for allowed in ({"nodes.spacing": 2.3}, {"nodes.spacing": 2.5, "model.kappa_eta": 1.5}):
+        parse_case(altered(allowed))
+
+
+def test_a_sweep_is_no_case() -> None:
+    [line] = lines({"base": altered({}), "axes": {}})
+    assert line.startswith("base: this is a sweep, not a case")
+
+
 def test_a_particle_outside_is_one_problem_not_two() -> None:
     [line] = lines(altered({"particles": {"centres": [[300, 30]], "radii": [20]}}))
     assert line.startswith("particles.centres[0] = [300.0, 30.0]: reaches [20.0, 20.0] to each side")

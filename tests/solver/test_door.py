@@ -43,7 +43,7 @@ def test_it_is_the_march_of_the_ranks(tmp_path: Path) -> None:
     """To the last bit: rows, snapshots and where they are."""
     directory = solve(PAIR, tmp_path / "run")
     result = simulate(load_case(tmp_path / "run.json"))
-    assert result.ended == "done"
+    assert result.ended == "succeeded"
     drop = {"wall_time": None}
     assert [row | drop for row in result.rows] == [row | drop for row in history(directory)]
     for name, stored in snapshots(directory).items():
@@ -57,7 +57,7 @@ def test_any_nodes_will_do(source: str, request: pytest.FixtureRequest) -> None:
     changes: dict[str, Any] = {"nodes": {"source": source, "spacing": 1.0}}
     result = simulate(SHORT | ({"shape_functions": {"kind": "linear"}} if source == "linear" else changes))
     seen, last = result.snapshots, result.final
-    assert (result.ended, result.notes, seen.time.tolist(), last.time) == ("done", [], [0.0, 0.05, 0.1], 0.1)
+    assert (result.ended, result.notes, seen.time.tolist(), last.time) == ("succeeded", [], [0.0, 0.05, 0.1], 0.1)
     assert seen.rho.shape == seen.particle.shape == seen.eta_squared.shape == (3, len(seen.nodes))
     np.testing.assert_array_equal(last.rho, seen.rho[-1])
     np.testing.assert_array_equal(last.particle, seen.particle[-1])

@@ -137,8 +137,13 @@ def test_run_json_says_who_what_when(pair: Path) -> None:
     assert start <= end
 
 
-def test_log_tells_the_end(pair: Path) -> None:
-    assert (pair / "log.txt").read_text().split()[1:] == ["succeeded"]
+def test_log_tells_what_happens(pair: Path) -> None:
+    """From start to end; compiling is told only where it came to that."""
+    told = [line.split(maxsplit=1)[1] for line in (pair / "log.txt").read_text().splitlines()]
+    order = ["start: ", "set-up", "steps", "succeeded"]
+    places = [next(i for i, line in enumerate(told) if line.startswith(words)) for words in order]
+    assert places == sorted(places)
+    assert places[-1] == len(told) - 1
 
 
 # --- snapshots ------------------------------------------------------------------------------------------

@@ -168,6 +168,21 @@ def test_refused(changes: Tree, start: str, words: str) -> None:
     assert any(line.startswith(start) and words in line for line in lines), lines
 
 
+def test_what_stands_in_the_wrong_place_is_told_its_place() -> None:
+    for tree, words in (
+        (base(), ["base: this is a case, not a sweep: `frit run` and `frit submit` take cases; a sweep has a [base]"]),
+        (
+            {"base": base(), "method": "lhs", "time": {"end": 1.0}},
+            ["method = 'lhs': put it in [sample]", "time: belongs to the case: put it in [base.time]"],
+        ),
+    ):
+        with pytest.raises(CaseError) as caught:
+            parse_sweep(tree)
+        found = str(caught.value).splitlines()
+        assert len(found) == len(words)
+        assert all(line.startswith(start) for line, start in zip(found, words, strict=True))
+
+
 @pytest.mark.parametrize("tree", [[], "sweep", None, 3])
 def test_not_a_table(tree: Any) -> None:
     with pytest.raises(CaseError, match="must be a"):

@@ -285,7 +285,7 @@ def test_nohup_is_heeded(folder: Path) -> None:
 
 
 def test_a_second_interrupt_kills(folder: Path) -> None:
-    """Ranks that do not listen leave no checkpoint here: that is a failure, not an interruption."""
+    """Ranks that do not listen leave no checkpoint here, and say nothing; run.json does not stay `running`."""
     with started(folder, "stubborn", stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         until_both_ranks_run(folder / "runs/two")
         process.send_signal(signal.SIGINT)
@@ -293,8 +293,22 @@ def test_a_second_interrupt_kills(folder: Path) -> None:
             process.wait(0.3)
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=20)
-    assert process.returncode == 1
-    assert "stopped before the first checkpoint was written" in err
+    assert process.returncode == 130
+    said = "stopped before the first checkpoint was written"
+    assert err == f"interrupted ({said}); `frit resume runs/two` goes on\n"
+    assert read_run(folder / "runs/two")["state"] == "interrupted"
+
+
+def test_a_parent_that_is_killed_leaves_a_checkpoint(folder: Path) -> None:
+    with started(folder, "waits", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        until_both_ranks_run(folder / "runs/two")
+        process.kill()
+    deadline = time.monotonic() + 20
+    while read_run(folder / "runs/two")["state"] == "running":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert read_run(folder / "runs/two")["state"] == "interrupted"
+    assert (folder / "runs/two/checkpoint.h5").exists()
 
 
 def test_ctrl_c_on_a_terminal(folder: Path) -> None:

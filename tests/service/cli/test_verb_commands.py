@@ -30,7 +30,9 @@ def test_change_rerun_rm(folder: Path) -> None:
         frit("log", long, "-f")
         assert "True" in frit("rm", long)
         assert [row["id"] for row in json.loads(frit("jobs", "--json"))] == [again["id"]]
-        assert sorted(path.name for path in (folder / "data" / "runs").iterdir()) == [again["id"]]
+        assert [path.name for path in (folder / "data" / "runs").iterdir() if path.is_dir()] == [again["id"]]
+    table = [line.split("\t") for line in (folder / "data" / "runs" / "INDEX.tsv").read_text().splitlines()]
+    assert table == [["id", "name", "sweep", "state"], [again["id"], "sleep 0.01", "", "succeeded"]]
 
 
 def test_sweeps_are_listed_shown_cancelled_tried_again_and_removed(folder: Path) -> None:
@@ -55,6 +57,21 @@ def test_sweeps_are_listed_shown_cancelled_tried_again_and_removed(folder: Path)
         frit("rm", sweep)
         assert json.loads(frit("jobs", "--json")) == []
         assert json.loads(frit("sweep", "list", "--json")) == []
+        assert "no sweeps yet" in frit("sweep", "list")
+
+
+def test_names_do_where_ids_are_and_tags_reach_reused_jobs(folder: Path) -> None:
+    (folder / "sweep.toml").write_text(SWEEP % "sleep 0")
+    with serving(folder):
+        frit("submit", "sweep.toml", "--wait")
+        frit("submit", "sweep.toml", "--tag", "again")
+        assert len(json.loads(frit("jobs", "tag=again", "state=succeeded", "state=failed", "--json"))) == 3
+        jobs = json.loads(frit("jobs", "--json"))
+        assert json.loads(frit("show", jobs[0]["name"], "--json"))["id"] == jobs[0]["id"]
+        assert "no job fits state=failed" in frit("jobs", "state=failed")
+        wrong = frit("show", "nobody", status=2)
+        assert all(words in wrong for words in ("job 'nobody': there is none", jobs[0]["id"]))
+        assert json.loads(frit("sweep", "show", "sleep 0", "--json"))["id"] == "s2"
 
 
 def test_gc_keeps_what_it_is_told(folder: Path) -> None:

@@ -113,10 +113,10 @@ BOX = {"container": [[0.0, 0.0], [100.0, 60.0]], "source": "packing"}
 @pytest.mark.parametrize(
     ("particles", "key", "value"),
     [
-        ({"mean_radius": 0.012, "packing_density": 0.5}, "mean_radius", 0.012),
+        ({"mean_radius": 0.12, "packing_density": 0.5}, "mean_radius", 0.12),
         ({"mean_radius": 1.0, "count": 1_000_000_000}, "count", 1_000_000_000),
-        ({"distribution": "histogram", "histogram": [[0.02, 1.0]], "packing_density": 0.5}, "histogram", [[0.02, 1.0]]),
-        ({"distribution": "histogram", "histogram": [[0.05, 1.0], [9.0, 0.1]], "count": 20_000}, "histogram", None),
+        ({"distribution": "histogram", "histogram": [[0.12, 1.0]], "packing_density": 0.5}, "histogram", [[0.12, 1.0]]),
+        ({"distribution": "histogram", "histogram": [[0.12, 1.0], [9.0, 0.1]], "count": 20_000}, "histogram", None),
     ],
 )
 def test_a_packing_is_reckoned_before_it_is_drawn(particles: Tree, key: str, value: Any) -> None:

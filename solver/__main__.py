@@ -96,7 +96,7 @@ class Requests:
                 self.early()
 
 
-def leave(directory: Path, root: bool) -> NoReturn:
+def leave(directory: Path, root: bool, fresh: bool) -> NoReturn:
     """End this process, and so all ranks, before the first step: at once, as compiling would take its time.
 
     Rank 0 writes that down, or another one where it waits for the others.
@@ -104,7 +104,9 @@ def leave(directory: Path, root: bool) -> NoReturn:
     if not root:
         time.sleep(SPOKEN)
     if root or output.read_state(directory) != "interrupted":
-        record_end(directory, "interrupted", "stopped before the first step")
+        begun = fresh and (directory / checkpoint.NAME).exists()
+        kept = "checkpoint at t = 0" if begun else "stopped before the first step"
+        record_end(directory, "interrupted", kept)
     os._exit(EXIT_STATUS["interrupted"])
 
 
@@ -114,9 +116,9 @@ def execute(
     """The whole run: how it ended, and a message where it did not end well."""
     directory = teller.directory
     asked, fresh = ranks.from_root(open_directory(arguments, directory) if ranks.root else None)
-    teller.owned, requests.early = True, lambda: leave(directory, ranks.root)
+    teller.owned, requests.early = True, lambda: leave(directory, ranks.root, fresh)
     if requests.end:
-        leave(directory, ranks.root)
+        leave(directory, ranks.root, fresh)
     teller.phase("start" if fresh else "resumed", f"{asked.name}, {ranks.size} ranks")
     if asked.particles.source == "packing" and fresh:
         teller.phase("packing")

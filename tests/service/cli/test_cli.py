@@ -299,18 +299,6 @@ def test_a_second_interrupt_kills(folder: Path) -> None:
     assert read_run(folder / "runs/two")["state"] == "interrupted"
 
 
-def test_a_parent_that_is_killed_leaves_a_checkpoint(folder: Path) -> None:
-    with started(folder, "waits", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        until_both_ranks_run(folder / "runs/two")
-        process.kill()
-    deadline = time.monotonic() + 20
-    while read_run(folder / "runs/two")["state"] == "running":
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert read_run(folder / "runs/two")["state"] == "interrupted"
-    assert (folder / "runs/two/checkpoint.h5").exists()
-
-
 def test_ctrl_c_on_a_terminal(folder: Path) -> None:
     """The kernel sends INT to the whole foreground, and the ranks must not be in it."""
     here, there = os.openpty()

@@ -85,6 +85,7 @@ def test_submit_wait_history_as_in_the_contract(client: Client, tmp_path: Path) 
     assert job.result["vacancy_ratio"] == history.vacancy_ratio.iloc[-1]
     assert [snapshot.time for snapshot in job.snapshots()] == [0.0, 0.001]
     assert httpx2.get(f"{job.zarr_url}/zarr.json").status_code == 200
+    assert job.open_zarr()["rho"].shape[0] == 2
     log = job.log_bytes()
     assert log == job.log().encode()
     assert job.log_bytes(10) == log[10:]
@@ -254,3 +255,14 @@ def test_histories_of_several_jobs_are_asked_for_within_limits(idle: Client) -> 
     assert "at most 100 jobs, and at most 100000 rows together: 11 times 10000" in str(refused.value.problem)
     with pytest.raises(ProblemError, match="there is none"):
         idle.get("/v1/histories", params={"id": f"{one},ffff"})
+
+
+def test_the_environment_tells_where_and_who(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FRIT_URL", "http://there:1/")
+    monkeypatch.setenv("FRIT_TOKEN", "secret")
+    with Client() as client:
+        assert client.url == "http://there:1"
+        assert client.storage_options() == {"headers": {"Authorization": "Bearer secret"}}
+    monkeypatch.delenv("FRIT_TOKEN")
+    with Client("http://here:2") as client:
+        assert (client.url, client.storage_options()) == ("http://here:2", {})

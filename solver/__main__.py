@@ -33,7 +33,7 @@ from .pack_store import place
 from .particle_file import ParticleFileError
 from .partition import Collector, Ranks, mpi_library
 from .revision import recorded, revision_of
-from .run import Ending, RunError, piled_up, run
+from .run import Ending, RunError, has_moved, piled_up, run
 from .setup import Setup, make_setup
 from .shape import ShapeError
 from .system import Progress, System
@@ -245,7 +245,8 @@ class Recorder:
             self.requests.early = None
             self.teller.phase("steps", f"compiled for {c:.1f} s" if (c := self.teller.compiled) else "")
         due = time.monotonic() - self.checkpoint_clock >= system.case.output.checkpoint_every
-        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end, self._moved(system, state)]
+        moved = has_moved(system, state, self.observables, self.ratios)
+        wanted = [due and self.ranks.root, self.requests.checkpoint, self.requests.end, moved]
         due, asked, stop, moved = self.ranks.max(np.array(wanted, dtype=float)) > 0.0
         if moved:
             self.history(system, state, system.at(state, integrator.y), state.time)
@@ -253,14 +254,6 @@ class Recorder:
         if (due or asked) and not stop:
             self.checkpoint(system, state, integrator)
         return bool(stop)
-
-    def _moved(self, system: System, state: Progress) -> bool:
-        """Whether the vacancy ratio is `output.history_change` of its first value away from that of the last row."""
-        change = system.case.output.history_change
-        if not change or not state.step or self.ratios is None:
-            return False
-        first, last = self.ratios
-        return first > 0.0 and abs(self.observables.vacancy_ratio(state) - last) >= change * first
 
     def checkpoint(self, system: System, state: Progress, integrator: Integrator) -> None:
         """Make the state durable, and the rows before it."""

@@ -26,7 +26,7 @@ from .integrators import Integrator
 from .output import Fields
 from .pack_store import packed
 from .partition import Collector, Ranks
-from .run import Ending, RunError, piled_up, run
+from .run import Ending, RunError, has_moved, piled_up, run
 from .setup import Setup, make_setup
 from .system import Progress, System
 
@@ -236,7 +236,10 @@ class Listener:
             self.fields.append(Moment(self.setup, system, state, u, at, {})._fields)
 
     def after_step(self, system: System, state: Progress, integrator: Integrator) -> bool:
-        """Show how far it is; True once somebody wants it to end."""
+        """A row where the vacancy ratio has moved; show how far it is; True once somebody wants it to end."""
+        ends = (self.rows[0]["vacancy_ratio"], self.rows[-1]["vacancy_ratio"]) if self.rows else None
+        if not self.stopped and has_moved(system, state, self.observables, ends):
+            self.history(system, state, system.at(state, integrator.y), state.time)
         self.show(state, self.rows[-1] if self.rows else {})
         return self.stopped or self.interrupted
 

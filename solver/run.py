@@ -114,6 +114,18 @@ def run(system: System, state: Progress, integrator: Integrator, observer: Obser
     return Ending.DONE
 
 
+def has_moved(system: System, state: Progress, rows: Any, ends: tuple[float, float] | None) -> bool:
+    """Whether the vacancy ratio is `output.history_change` of its first value away from that of the last row.
+
+    rows: what computes them; ends: the ratios of the first and the last row. Collective.
+    """
+    change = system.case.output.history_change
+    if not change or not state.step or ends is None:
+        return False
+    first, last = ends
+    return first > 0.0 and bool(abs(rows.vacancy_ratio(state) - last) >= change * first)
+
+
 def reached(waiting: list[Event], time: float) -> Iterator[Event]:
     """Take the events up to a time off the list."""
     while waiting and waiting[0].time <= time:

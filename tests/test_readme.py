@@ -125,11 +125,16 @@ def test_every_case_and_sweep_is_accepted(folder: Path) -> None:
     expand(load_sweep(ROOT / "sweeps" / "quick.toml"))
 
 
-@pytest.mark.parametrize(
-    ("file", "section"),
-    [("README.md", "Run a case"), ("README.md", "Packings and sweeps"), ("sweeps/README.md", "A sweep file")],
-)
-def test_the_commands_do_what_they_say(folder: Path, file: str, section: str) -> None:
+def test_commands_and_then_scripts_do_what_they_say(folder: Path) -> None:
+    for file, section in (
+        ("README.md", "Run a case"), ("README.md", "Packings and sweeps"), ("sweeps/README.md", "A sweep file"),
+    ):  # fmt: skip
+        run_commands(folder, file, section)
+    for file in ("README.md", "sweeps/README.md"):
+        run_scripts(folder, file)
+
+
+def run_commands(folder: Path, file: str, section: str) -> None:
     lines = commands(file, section)
     assert len(lines) >= 3
     for line in lines:
@@ -142,11 +147,8 @@ def test_the_commands_do_what_they_say(folder: Path, file: str, section: str) ->
         assert "lowest vacancy ratio: " in done.output
 
 
-@pytest.mark.parametrize("file", ["README.md", "sweeps/README.md"])
-def test_the_scripts_run(folder: Path, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def run_scripts(folder: Path, file: str) -> None:
     """In the place of the service's address, that of one which listens here."""
-    if not (folder / "data").exists():
-        pytest.skip("follows the commands")
     codes = blocks(file, "python")
     assert codes
     with listening(folder / "served", free_disk=0) as url:

@@ -66,7 +66,9 @@ def show_table(rows: Sequence[Mapping[str, Any]], none: str | None = None) -> No
     What does not fit is cut in the middle of prose, never of an id or a number.
     """
     if rows or none is None:
-        Console(width=None if sys.stdout.isatty() else WIDTH, markup=False).print(table_of(rows))
+        console, table = Console(width=None if sys.stdout.isatty() else WIDTH, markup=False), table_of(rows)
+        console.width = max(console.width, console.measure(table).minimum)
+        console.print(table)
     else:
         typer.echo(none)
 

@@ -111,7 +111,7 @@ def test_what_an_older_solver_computed_is_told_and_computed_anew_when_asked(fold
     assert told not in frit("compare", "sleep 0", "--data", "data")  # of a name, the newest
     with serving(folder):
         assert frit("submit", file, "--recompute", "--wait").splitlines()[0] == "s4"
-        frit("submit", "case.toml", "--recompute")
+        frit("submit", "case.toml", "--again")
     assert len(list((data / "runs").glob("*/calls"))) == 6
 
 

@@ -79,7 +79,8 @@ def test_gc_keeps_what_it_is_told(folder: Path) -> None:
     with serving(folder):
         first = frit("submit", "case.toml", "--wait").split()[0]
         frit("submit", "no.toml", "--wait", status=1)
-        second = frit("submit", "case.toml", "--wait").split()[0]
+        assert frit("submit", "case.toml", "--wait").split()[0] == first, "the same case"
+        second = frit("submit", "case.toml", "--again", "--wait").split()[0]
         [failed] = [row["id"] for row in json.loads(frit("jobs", "state=failed", "--json"))]
         assert json.loads(frit("gc", "--keep", "1d", "--json")) == []
         listed = json.loads(frit("gc", "--keep", "succeeded", "--dry-run", "--json"))

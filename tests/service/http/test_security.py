@@ -176,6 +176,10 @@ def test_a_running_service_sees_a_new_and_a_revoked_token_at_once(tmp_path: Path
 
 def test_the_commands_of_tokens(tmp_path: Path) -> None:
     run, data = CliRunner(), ["--data", str(tmp_path / "new")]
+    missing = run.invoke(commands_token.app, ["list", "--json", *data])
+    assert (missing.exit_code, missing.stdout) == (2, "")
+    assert str(tmp_path / "new") in missing.stderr
+    (tmp_path / "new").mkdir()
     empty = run.invoke(commands_token.app, ["list", "--json", *data])
     assert (empty.exit_code, json.loads(empty.stdout)) == (0, [])
     made = run.invoke(commands_token.app, ["create", "--name", "me", "--scope", "admin", "--json", *data])

@@ -76,7 +76,7 @@ def killed_at(point: str, data: Path, *jobs: str) -> None:
 def there(data: Path) -> dict[str, bool]:
     """The jobs of the index, and whether their folders are whole; no folder is there without a job."""
     found = {row["id"]: (data / "runs" / row["id"] / "exit.json").exists() for row in rows(data / "frit.db", "jobs")}
-    assert {path.name for path in (data / "runs").iterdir()} <= found.keys()
+    assert {path.name for path in (data / "runs").iterdir() if path.is_dir()} <= found.keys()
     return found
 
 

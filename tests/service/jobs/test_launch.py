@@ -197,10 +197,10 @@ def test_a_checkpoint_then_a_stop(run: Path) -> None:
 
 @pytest.mark.parametrize(
     ("checkpoint", "state", "word"),
-    [(True, "interrupted", "last one"), (False, "failed", "before the first")],
+    [(True, "interrupted", "last one"), (False, "interrupted", "before the first")],
 )
 def test_ranks_that_ignore_a_stop_are_killed(run: Path, checkpoint: bool, state: str, word: str) -> None:
-    """What is left of them decides: with an earlier checkpoint the run can go on."""
+    """With an earlier checkpoint the run can go on from that, else anew."""
     if checkpoint:
         (run / "checkpoint.h5").touch()
     with Launch(2, ["stubborn"], run) as started:

@@ -121,7 +121,8 @@ def test_on_a_full_disk_nothing_is_lost_and_all_goes_on_once_there_is_room(
 
 
 def test_a_solver_without_room_is_tried_again_from_its_checkpoint(disk: Path) -> None:
-    case = {**PAIR, "time": {**PAIR["time"], "end": 0.2}}
+    output = {**PAIR.get("output", {}), "history_change": 0.0}
+    case = {**PAIR, "time": {**PAIR["time"], "end": 0.2}, "output": output}
 
     async def serve() -> None:
         async with Engine(settings(disk, free_disk=ROOM)) as engine:

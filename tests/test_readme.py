@@ -125,13 +125,13 @@ def test_every_case_and_sweep_is_accepted(folder: Path) -> None:
     expand(load_sweep(ROOT / "sweeps" / "quick.toml"))
 
 
-def test_commands_and_then_scripts_do_what_they_say(folder: Path) -> None:
+def test_commands_and_then_scripts_do_what_they_say(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for file, section in (
         ("README.md", "Run a case"), ("README.md", "Packings and sweeps"), ("sweeps/README.md", "A sweep file"),
     ):  # fmt: skip
         run_commands(folder, file, section)
     for file in ("README.md", "sweeps/README.md"):
-        run_scripts(folder, file)
+        run_scripts(folder, file, monkeypatch)
 
 
 def run_commands(folder: Path, file: str, section: str) -> None:
@@ -147,11 +147,12 @@ def run_commands(folder: Path, file: str, section: str) -> None:
         assert "lowest vacancy ratio: " in done.output
 
 
-def run_scripts(folder: Path, file: str) -> None:
+def run_scripts(folder: Path, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the place of the service's address, that of one which listens here."""
     codes = blocks(file, "python")
     assert codes
     with listening(folder / "served", free_disk=0) as url:
+        monkeypatch.setenv("FRIT_URL", url)
         for code in codes:
             names: dict[str, Any] = {}
             exec(compile(code.replace("http://127.0.0.1:8000", url), file, "exec"), names)

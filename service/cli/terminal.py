@@ -67,7 +67,8 @@ def show_table(rows: Sequence[Mapping[str, Any]], none: str | None = None) -> No
     """
     if rows or none is None:
         console, table = Console(width=None if sys.stdout.isatty() else WIDTH, markup=False), table_of(rows)
-        console.width = max(console.width, console.measure(table).minimum)
+        least = console.measure(table, options=console.options.update(width=10 * WIDTH)).minimum
+        console.width = max(console.width, least)
         console.print(table)
     else:
         typer.echo(none)

@@ -87,7 +87,8 @@ def main() -> int:
         free = [on_free_nodes(tree, Path(folder) / f"{len(tree['domain']['size'])}.vtk") for tree in (DISCS, SPHERES)]
         for number, tree in enumerate(CASES + free):
             start, case, directory = time.monotonic(), Path(folder) / f"{number}.json", Path(folder) / str(number)
-            case.write_text(json.dumps(tree))
+            kept = {**tree["output"], "keep_checkpoint": True}  # to be resumed
+            case.write_text(json.dumps({**tree, "output": kept}))
             commands = [[str(case), "--out", str(directory)], ["--resume", str(directory)]]
             resumed = tree["name"] in (DISCS["name"], "2-D, triangular")
             for arguments in commands if resumed else commands[:1]:

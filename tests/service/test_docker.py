@@ -24,6 +24,7 @@ from frit.service.client import Client
 from frit.service.http.app import create_app
 from frit.service.jobs.launch import kill_marked
 from frit.service.settings import Settings
+from frit.solver.durable import read_json
 
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())
@@ -270,7 +271,7 @@ def test_the_service_solves_without_compiling_and_leaves_a_checkpoint_when_it_is
                 assert job.data["state"] == "succeeded", job.data
                 assert compiled(data / ".cache") == compiled(image.root / "opt" / "frit" / "compiled") != {}
                 long = client.submit(LONG)
-                until(lambda: (data / "runs" / long.id / "progress.json").exists())
+                until(lambda: read_json(data / "runs" / long.id / "progress.json").get("step", 0) > 0)
             os.kill(int((data / "lock").read_text()), signal.SIGTERM)
             process.wait(TIMEOUT)
         finally:

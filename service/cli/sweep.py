@@ -14,7 +14,7 @@ import typer
 from frit.solver.characters import visible
 
 from .speaking import HERE, Secret, SweepId, Url, find_sweep, row, speaking, tell, tell_rows
-from .terminal import AsJson, DataFolder, Recompute, Shown, SweepFile, must_be_there, of_older, refuse, show_table
+from .terminal import AsJson, DataFolder, Recompute, Shown, SweepFile, of_older, refuse, show_table
 
 app = typer.Typer(no_args_is_help=True, help="Sweeps: their cost, running them without a server, those of a service.")
 
@@ -30,7 +30,8 @@ def plan(
     from ..index.store import Store
 
     expansion = expanded(file)[1]
-    must_be_there(data)
+    if not data.is_dir():
+        typer.echo(f"--data {data}: not there yet, so no job of it counts as done", err=True)
     past, done, older = list[Measured](), set[str](), dict[str, int]()
     if (data / "frit.db").exists():
         store = Store(data, writable=False)

@@ -75,7 +75,8 @@ def sweep(folder: Path, name: str) -> str:
 def test_a_sweep_without_a_server_runs_only_what_is_missing(folder: Path) -> None:
     file = sweep(folder, "sleep 0")
     new = typed("sweep", "plan", file, "--data", "new/data")
-    assert re.search(r"to run\s+3", new) and not Path("new").exists()
+    assert re.search(r"to run\s+3", new)
+    assert not Path("new").exists()
     assert re.search(r"to run\s+3", frit("sweep", "plan", file, "--data", "data"))
     rows = json.loads(frit("sweep", "run", file, "--data", "data", "--json"))
     assert [(row["D_surf"], row["state"]) for row in rows] == [(d, "succeeded") for d in (2.0, 4.0, 6.0)]
